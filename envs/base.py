@@ -1,0 +1,73 @@
+"""The protocol that every environment of two players follows.
+
+An environment is a bundle of pure functions; its state is explicit and holds no key.
+Functions are unbatched: callers `vmap` over games, styles and seeds. Nothing resets by
+itself, so a terminal observation is never mixed up with the first one of the next game.
+"""
+
+from typing import Any, NamedTuple, Protocol
+
+import jax
+from flax.struct import PyTreeNode
+
+AGENTS = ("ego", "partner")
+
+
+class Pair(NamedTuple):
+    """One thing for each player; the two may differ in shape."""
+
+    ego: Any
+    partner: Any
+
+
+class TimeStep(PyTreeNode):
+    """What a step (or a reset) shows.
+
+    Attributes:
+        observation: `Pair` of float32 arrays [O].
+        reward: team reward, float32 [].
+        shaped_reward: a learning aid for each player, float32 [agent]; never part of a score.
+        terminated: the task ended by its own rules, bool [].
+        truncated: the time was up, bool [].
+        events: how often each event happened in this step, float32 [agent, event].
+    """
+
+    observation: Pair
+    reward: jax.Array
+    shaped_reward: jax.Array
+    terminated: jax.Array
+    truncated: jax.Array
+    events: jax.Array
+
+    @property
+    def done(self) -> jax.Array:
+        """Whether the game is over, for either reason, bool []."""
+        return self.terminated | self.truncated
+
+
+class Environment(Protocol):
+    """Two players, one of them (the partner) of a style that the other cannot see."""
+
+    name: str
+    style_names: tuple[str, ...]
+    styles: Any
+    """All styles stacked: a pytree with leading axis [style]."""
+    event_names: tuple[str, ...]
+    """Names of the events of one player, in the order of `TimeStep.events`' last axis."""
+    num_actions: Pair
+    observation_sizes: Pair
+    max_steps: int
+
+    def style(self, name: str) -> Any:
+        """Returns one style. Raises ValueError for an unknown name."""
+        ...
+
+    def reset(self, key: jax.Array, style: Any) -> tuple[Any, TimeStep]:
+        """Starts a game; consumes `key`."""
+        ...
+
+    def step(
+        self, key: jax.Array, state: Any, actions: Pair, style: Any
+    ) -> tuple[Any, TimeStep]:
+        """Plays one step; consumes `key`."""
+        ...

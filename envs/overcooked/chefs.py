@@ -1,0 +1,128 @@
+"""The two chefs of an Overcooked kitchen, drawn as shapes on a tile.
+
+A chef's face, hands and held item point where it faces; the ego wears blue and a tall hat, the
+partner green and a flat beret, so that they differ in outline as well as in colour.
+"""
+
+from __future__ import annotations
+
+import functools
+from dataclasses import dataclass
+
+from envs.overcooked.drawing import Ellipse, Line, Polygon, Rect, Shape, circle, place
+from envs.overcooked.sprites import INK, item_shapes
+
+NORTH, SOUTH, EAST, WEST = range(4)
+
+
+@dataclass(frozen=True)
+class ChefColours:
+    """A chef's jacket and hat, their darker trim, the lighter apron, and the hair."""
+
+    main: str
+    dark: str
+    light: str
+    hair: str
+
+
+# The two main colours differ in lightness too, for readers who can not tell blue from green.
+EGO = ChefColours(main="#2a62c8", dark="#173f8a", light="#c9dcfb", hair="#4a2f1d")
+PARTNER = ChefColours(main="#35b57c", dark="#147a4d", light="#d5f5e4", hair="#1f1b1a")
+_SKIN, _SKIN_EDGE, _CHEEK = "#f7d3ae", "#c98f5f", "#f0a58a"
+_HEAD_X, _HEAD_Y = 32.0, 29.0
+
+
+@functools.cache
+def chef_shapes(agent: int, orientation: int, held: int) -> tuple[Shape, ...]:
+    """A chef on its tile, with the item it holds.
+
+    Args:
+        agent: 0 the ego, 1 the partner.
+        orientation: 0 north, 1 south, 2 east, 3 west.
+        held: the item's code.
+    """
+    colours = (EGO, PARTNER)[agent]
+    shadow = Ellipse(32, 58.5, 17, 4, "#000000", opacity=0.16)
+    torso = _torso(colours, orientation)
+    head = (*_head(colours, orientation), *_hat(agent, colours))
+    front = _hands_and_item(colours, orientation, held)
+    if orientation == NORTH:
+        # What it holds is beyond it: the head goes in front of the arms, the item above the hat.
+        return (shadow, *torso, *head, *front)
+    return (shadow, *torso, *head, *front)
+
+
+def _torso(colours: ChefColours, orientation: int) -> tuple[Shape, ...]:
+    feet = (Ellipse(25.5, 57.5, 5, 3.2, INK), Ellipse(38.5, 57.5, 5, 3.2, INK))
+    jacket = Rect(19, 37, 26, 20, colours.main, 9, colours.dark, 1.8)
+    if orientation == NORTH:
+        bow = (
+            Line(((20, 48), (44, 48)), colours.light, 2.2),
+            Polygon(((32, 48), (26.5, 44.5), (26.5, 51.5)), colours.light),
+            Polygon(((32, 48), (37.5, 44.5), (37.5, 51.5)), colours.light),
+        )
+        return (*feet, jacket, *bow)
+    shift = {SOUTH: 0.0, EAST: 5.0, WEST: -5.0}[orientation]
+    apron = Rect(25 + shift, 41, 14, 15, colours.light, 3.5)
+    return (*feet, jacket, apron)
+
+
+def _head(colours: ChefColours, orientation: int) -> tuple[Shape, ...]:
+    x, y = _HEAD_X, _HEAD_Y
+    if orientation == NORTH:
+        ears = (circle(x - 12.5, y + 1, 3, _SKIN), circle(x + 12.5, y + 1, 3, _SKIN))
+        return (*ears, circle(x, y, 12.5, colours.hair))
+    face = circle(x, y, 12.5, _SKIN, _SKIN_EDGE, 1.4)
+    if orientation == SOUTH:
+        return (
+            circle(x - 12.5, y + 1, 3, _SKIN, _SKIN_EDGE, 1.2),
+            circle(x + 12.5, y + 1, 3, _SKIN, _SKIN_EDGE, 1.2),
+            face,
+            Ellipse(x - 4.8, y - 0.5, 1.9, 2.5, INK),
+            Ellipse(x + 4.8, y - 0.5, 1.9, 2.5, INK),
+            circle(x - 8, y + 4.4, 2.1, _CHEEK, opacity=0.75),
+            circle(x + 8, y + 4.4, 2.1, _CHEEK, opacity=0.75),
+            Line(((x - 3, y + 5.2), (x - 1, y + 6.6), (x + 1, y + 6.6), (x + 3, y + 5.2)), INK, 1.5),
+        )
+    side = 1.0 if orientation == EAST else -1.0
+    return (
+        face,
+        Ellipse(x - side * 8.3, y + 0.5, 4.6, 9, colours.hair),
+        circle(x - side * 3.2, y + 1.5, 2.8, _SKIN, _SKIN_EDGE, 1.2),
+        circle(x + side * 13.2, y + 2, 2.7, _SKIN, _SKIN_EDGE, 1.2),
+        Ellipse(x + side * 6.6, y - 0.8, 1.9, 2.5, INK),
+        circle(x + side * 4.6, y + 5, 2.1, _CHEEK, opacity=0.75),
+        Line(((x + side * 6.5, y + 7), (x + side * 8.5, y + 7.6), (x + side * 10, y + 6.4)), INK, 1.5),
+    )
+
+
+def _hat(agent: int, colours: ChefColours) -> tuple[Shape, ...]:
+    x, y = _HEAD_X, _HEAD_Y
+    if agent == 0:
+        puff = tuple(
+            circle(x + dx, y + dy, radius, colours.main, colours.dark, 1.8)
+            for dx, dy, radius in ((-7.5, -17, 6.5), (7.5, -17, 6.5), (0, -19.5, 7))
+        )
+        crown = Rect(x - 9, y - 18, 18, 9, colours.main)
+        band = Rect(x - 11.5, y - 12, 23, 6.5, colours.light, 2.5, colours.dark, 1.8)
+        return (*puff, crown, band)
+    beret = Ellipse(x, y - 12.5, 17, 7.5, colours.main, colours.dark, 1.8)
+    stalk = Line(((x, y - 19.5), (x + 2, y - 23)), colours.dark, 3)
+    band = Rect(x - 11.5, y - 10.5, 23, 5, colours.light, 2.5, colours.dark, 1.8)
+    return (stalk, beret, band)
+
+
+def _hands_and_item(colours: ChefColours, orientation: int, held: int) -> tuple[Shape, ...]:
+    hand_places, sleeves, item_place = {
+        NORTH: (((19, 17), (45, 17)), ((20.5, 43), (43.5, 43)), (32, 10)),
+        SOUTH: (((22.5, 52), (41.5, 52)), ((20, 43), (44, 43)), (32, 50)),
+        EAST: (((44, 50), (46, 52)), ((34, 44), (36, 46)), (52, 47)),
+        WEST: (((20, 50), (18, 52)), ((30, 44), (28, 46)), (12, 47)),
+    }[orientation]
+    arms = tuple(
+        Line((sleeve, hand), colours.dark, 6.5)
+        for sleeve, hand in zip(sleeves, hand_places, strict=True)
+    )
+    hands = tuple(circle(x, y, 3.8, _SKIN, _SKIN_EDGE, 1.2) for x, y in hand_places)
+    item = place(item_shapes(held), *item_place, 0.9)
+    return (*arms, *item, *hands)

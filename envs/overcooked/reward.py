@@ -1,0 +1,164 @@
+"""Rewards of the kitchen: deliveries, the reference's shaping, and our own.
+
+The reference's shaped reward pays for potting (3), a useful dish (3) and a soup taken from
+the pot (5), whatever the soup. In kitchens of two rooms that is farmed with soups that
+nobody ordered, and it says nothing about hand-overs; `guided_shaping` mends both.
+"""
+
+import dataclasses
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+
+from envs.overcooked import dynamics
+from envs.overcooked.dynamics import Interaction, State, Transition
+from envs.overcooked.layouts import Layout
+
+NUM_CONTENTS = 16
+"""Content codes run from 0 to 12; the tables have 16 rows."""
+
+
+@dataclasses.dataclass(frozen=True)
+class ShapingWeights:
+    """Weights of the guided shaping, in units of the team reward (a soup pays 20).
+
+    `potting`, `dish` and `soup_taken` are the reference's. Starting an unfinished pot takes
+    back what its ingredients paid.
+    """
+
+    potting: float = 3.0
+    dish: float = 3.0
+    soup_taken: float = 5.0
+    start_full: float = 1.0
+    start_unfinished: float = -3.0
+    spoilt: float = -3.0
+    unpaid_delivery: float = -5.0
+    hand_over: float = 1.0
+
+
+def order_values(orders: tuple[int, ...], soup_reward: float = 20.0) -> np.ndarray:
+    """Returns what a soup of each content pays, float32 [content]."""
+    values = np.zeros(NUM_CONTENTS, np.float32)
+    values[list(orders)] = soup_reward
+    return values
+
+
+def reachable_values(values: jax.Array) -> jax.Array:
+    """Returns the best pay that each content can still become by adding ingredients.
+
+    Args:
+        values: pay by content, float [content].
+
+    Returns:
+        float [content]; 0 for contents of which no paying soup can be made.
+    """
+    content = np.arange(NUM_CONTENTS)
+    onions, tomatoes = content >> 2, content & 3
+    becomes = (onions[:, None] <= onions) & (tomatoes[:, None] <= tomatoes)
+    return jnp.max(jnp.where(becomes, values, 0.0), axis=1)
+
+
+def delivery_reward(layout: Layout, interaction: Interaction, pays: jax.Array) -> jax.Array:
+    """Returns what each player's delivery pays, float32 [agent].
+
+    Args:
+        layout: the kitchen.
+        interaction: leading axis [agent].
+        pays: pay by station and content, float32 [K, content].
+    """
+    station = jnp.minimum(interaction.station, len(layout.stations) - 1)
+    content = jnp.maximum(interaction.item - dynamics.SOUP, 0)
+    delivered = interaction.change == dynamics.DELIVERED
+    return jnp.where(delivered, pays[station, content], 0.0)
+
+
+def dish_is_useful(layout: Layout, pots: State, seen: State) -> jax.Array:
+    """Whether taking a dish now is useful, bool [].
+
+    There is no dish on a counter, and fewer dishes in hands than pots that are cooking,
+    ready or partly filled. The reference looks at the pots as they were when the step
+    began (`pots`) and at the rest as the acting player meets it (`seen`).
+    """
+    amount = dynamics.num_ingredients(pots.pot_content)
+    cooked = pots.pot_timer >= 0
+    waiting = jnp.sum(cooked | ((amount > 0) & (amount < 3)))
+    in_hands = jnp.sum(seen.held == dynamics.DISH)
+    return (in_hands < waiting) & ~jnp.any(seen.counters == dynamics.DISH)
+
+
+def useful_dishes(layout: Layout, transition: Transition) -> jax.Array:
+    """Returns whether each player took a useful dish from the dispenser, bool [agent]."""
+    interaction = transition.interactions
+    useful = jnp.stack(
+        [
+            dish_is_useful(layout, transition.before, seen)
+            for seen in (transition.before, transition.between)
+        ]
+    )
+    took_dish = interaction.item == dynamics.DISH
+    return useful & took_dish & (interaction.change == dynamics.TAKEN_FROM_DISPENSER)
+
+
+def reference_shaping(layout: Layout, transition: Transition) -> jax.Array:
+    """Returns overcooked-ai's shaped reward, float32 [agent].
+
+    Source: `OvercookedGridworld.resolve_interacts`, overcooked-ai 1.1.0, default parameters.
+    """
+    change = transition.interactions.change
+    return (
+        3.0 * (change == dynamics.POTTED)
+        + 3.0 * useful_dishes(layout, transition)
+        + 5.0 * (change == dynamics.SOUP_TAKEN)
+    )
+
+
+def guided_shaping_terms(
+    layout: Layout,
+    transition: Transition,
+    *,
+    pays: jax.Array,
+    hand_over: jax.Array,
+    weights: ShapingWeights,
+) -> dict[str, jax.Array]:
+    """Returns our shaped reward by named term, each float32 [agent].
+
+    Args:
+        layout: the kitchen.
+        transition: the step.
+        pays: pay by station and content, float32 [K, content].
+        hand_over: potential of an item kind (onion, tomato, dish, soup) lying on each
+            counter, float32 [C, 4]: positive where the other player needs it, negative where
+            it is in the way. A player is paid the potential's change that it causes, so
+            putting a thing down and taking it back earns nothing.
+        weights: the terms' weights.
+    """
+    did = transition.interactions
+    soup_values = jnp.max(pays, axis=0)
+    reachable = reachable_values(soup_values)
+    ingredient = jnp.where(did.item == dynamics.ONION, 4, 1)
+    potted = did.change == dynamics.POTTED
+    # The content index is clipped by XLA where nothing was potted.
+    viable = reachable[jnp.minimum(did.content + ingredient, NUM_CONTENTS - 1)] > 0
+    complete = soup_values[did.content] > 0
+    started = did.change == dynamics.COOKING_STARTED
+    amount = dynamics.num_ingredients(did.content)
+    taken = did.change == dynamics.SOUP_TAKEN
+    delivered = did.change == dynamics.DELIVERED
+    unpaid = delivered & (delivery_reward(layout, did, pays) == 0)
+
+    counter = jnp.minimum(did.station, layout.num_counters - 1)
+    kind = jnp.clip(did.item, 1, dynamics.SOUP) - 1
+    value = hand_over[counter, kind]
+    put = did.change == dynamics.PUT_ON_COUNTER
+    picked = did.change == dynamics.TAKEN_FROM_COUNTER
+    return {
+        "potting": weights.potting * (potted & viable),
+        "spoilt": weights.spoilt * (potted & ~viable),
+        "dish": weights.dish * useful_dishes(layout, transition),
+        "start_full": weights.start_full * (started & complete),
+        "start_unfinished": weights.start_unfinished * jnp.where(started & ~complete, amount, 0),
+        "soup_taken": weights.soup_taken * (taken & complete),
+        "unpaid_delivery": weights.unpaid_delivery * unpaid,
+        "hand_over": weights.hand_over * value * (put.astype(jnp.float32) - picked),
+    }
