@@ -66,8 +66,6 @@ class Environment(Protocol):
         """Starts a game; consumes `key`."""
         ...
 
-    def step(
-        self, key: jax.Array, state: Any, actions: Pair, style: Any
-    ) -> tuple[Any, TimeStep]:
+    def step(self, key: jax.Array, state: Any, actions: Pair, style: Any) -> tuple[Any, TimeStep]:
         """Plays one step; consumes `key`."""
         ...

@@ -82,7 +82,9 @@ def _head(colours: ChefColours, orientation: int) -> tuple[Shape, ...]:
             Ellipse(x + 4.8, y - 0.5, 1.9, 2.5, INK),
             circle(x - 8, y + 4.4, 2.1, _CHEEK, opacity=0.75),
             circle(x + 8, y + 4.4, 2.1, _CHEEK, opacity=0.75),
-            Line(((x - 3, y + 5.2), (x - 1, y + 6.6), (x + 1, y + 6.6), (x + 3, y + 5.2)), INK, 1.5),
+            Line(
+                ((x - 3, y + 5.2), (x - 1, y + 6.6), (x + 1, y + 6.6), (x + 3, y + 5.2)), INK, 1.5
+            ),
         )
     side = 1.0 if orientation == EAST else -1.0
     return (
@@ -92,7 +94,9 @@ def _head(colours: ChefColours, orientation: int) -> tuple[Shape, ...]:
         circle(x + side * 13.2, y + 2, 2.7, _SKIN, _SKIN_EDGE, 1.2),
         Ellipse(x + side * 6.6, y - 0.8, 1.9, 2.5, INK),
         circle(x + side * 4.6, y + 5, 2.1, _CHEEK, opacity=0.75),
-        Line(((x + side * 6.5, y + 7), (x + side * 8.5, y + 7.6), (x + side * 10, y + 6.4)), INK, 1.5),
+        Line(
+            ((x + side * 6.5, y + 7), (x + side * 8.5, y + 7.6), (x + side * 10, y + 6.4)), INK, 1.5
+        ),
     )
 
 

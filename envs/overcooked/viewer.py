@@ -1,8 +1,8 @@
 """Pictures of an Overcooked game: one state as SVG, PNG or array, an episode as GIF.
 
-    scene = draw_state(layout, state, style=style, score=40, title="left", caption="I stay left.")
-    save_png("kitchen.png", scene, scale=2)
-    save_gif("episode.gif", layout, states, style=style, scores=scores, title="left")
+scene = draw_state(layout, state, style=style, score=40, title="left", caption="I stay left.")
+save_png("kitchen.png", scene, scale=2)
+save_gif("episode.gif", layout, states, style=style, scores=scores, title="left")
 """
 
 from __future__ import annotations
@@ -331,9 +331,7 @@ def _header(
 
 def _caption(caption: str, width: float) -> tuple[Shape, ...]:
     lines = wrap_text(caption, _CAPTION_SIZE, width - 2 * _MARGIN - 8)
-    bar = Rect(
-        _MARGIN, 10, 3, _CAPTION_LEADING * len(lines), chefs.PARTNER.main, 1.5
-    )
+    bar = Rect(_MARGIN, 10, 3, _CAPTION_LEADING * len(lines), chefs.PARTNER.main, 1.5)
     rows = (
         Text(_MARGIN + 11, 23.5 + _CAPTION_LEADING * k, line, _CAPTION_SIZE, INK)
         for k, line in enumerate(lines)

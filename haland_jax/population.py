@@ -1,0 +1,78 @@
+"""One compiled program for a population: `vmap` over its members, sharded over the devices.
+
+One XLA program does not fill the cores of a CPU by itself. Split the host into several
+devices (`jax.config.update("jax_num_cpu_devices", 2)` before the first computation) and a
+population is shared out over them; the same code runs on several GPUs.
+"""
+
+from collections.abc import Callable
+from typing import Any
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+from jax.sharding import Mesh, NamedSharding, PartitionSpec
+
+Population = Any
+"""A pytree whose leaves have the leading axis [member]."""
+
+
+def population_size(population: Population) -> int:
+    """Returns the number of members."""
+    return jax.tree.leaves(population)[0].shape[0]
+
+
+def over_population(
+    function: Callable[..., Any], *, shared: int = 0, donate: tuple[int, ...] = ()
+) -> Callable[..., Any]:
+    """Compiles a function of one member into one of a population.
+
+    Args:
+        function: takes `shared` arguments that are the same for all members, then arguments
+            of one member.
+        shared: how many leading arguments are shared.
+        donate: positions of the arguments whose buffers may be overwritten.
+
+    Returns:
+        A jitted function: shared arguments, then populations of the same size, to a
+        population. A population that the devices do not divide is filled up with copies of
+        its last member, which are dropped from the result.
+    """
+    devices = jax.devices()
+    mesh = Mesh(np.array(devices), ("member",))
+    members = PartitionSpec("member")
+
+    def mapped(*arguments: Any) -> Any:
+        common, own = arguments[:shared], arguments[shared:]
+        return jax.vmap(lambda *one: function(*common, *one))(*own)
+
+    def call(*arguments: Any) -> Any:
+        common, own = arguments[:shared], arguments[shared:]
+        size = population_size(own)
+        missing = -size % len(devices)
+        if missing:
+            own = jax.tree.map(lambda leaf: _filled_up(leaf, missing), own)
+        sharded = jax.shard_map(
+            mapped,
+            mesh=mesh,
+            in_specs=(*([PartitionSpec()] * shared), *([members] * len(own))),
+            out_specs=members,
+            check_vma=False,
+        )
+        result = sharded(*common, *own)
+        return jax.tree.map(lambda leaf: leaf[:size], result) if missing else result
+
+    return jax.jit(call, donate_argnums=donate)
+
+
+def share_out(population: Population) -> Population:
+    """Puts a population onto the devices, so that a compiled call need not move it."""
+    devices = jax.devices()
+    if population_size(population) % len(devices):
+        return population
+    mesh = Mesh(np.array(devices), ("member",))
+    return jax.device_put(population, NamedSharding(mesh, PartitionSpec("member")))
+
+
+def _filled_up(leaf: jax.Array, missing: int) -> jax.Array:
+    return jnp.concatenate([leaf, jnp.repeat(leaf[-1:], missing, axis=0)])

@@ -1,0 +1,427 @@
+"""Proximal policy optimisation for a pair of players (Schulman et al., 2017).
+
+`train_chunk` advances one pair by some updates, as a pure function of explicit state; callers
+map it over styles and seeds. Both players learn, or the ego alone against frozen partners.
+The style binds the partner; early in training the ego may be held to its role as well, and
+is then released (`confined_until`).
+"""
+
+import dataclasses
+from functools import partial
+from typing import Any
+
+import jax
+import jax.numpy as jnp
+import optax
+from flax.struct import PyTreeNode
+
+from envs.base import Environment, Pair
+from haland_jax import networks
+from haland_jax.networks import MLPActor, MLPCritic, Policy
+
+
+@dataclasses.dataclass(frozen=True)
+class PPOConfig:
+    """Settings of one training run.
+
+    Attributes:
+        total_steps: environment steps of one pair.
+        num_envs: games played in parallel by one pair.
+        rollout_steps: steps of each game between two updates.
+        epochs: passes over each batch.
+        num_minibatches: minibatches a pass; must divide `num_envs`.
+        learning_rate: at the start; it falls linearly to `final_learning_rate`.
+        final_learning_rate: at the end.
+        entropy: weight of the entropy bonus at the start; it falls linearly.
+        final_entropy: weight of the entropy bonus at the end.
+        discount: γ.
+        gae_lambda: λ of the generalised advantage estimate.
+        clip: ε of the clipped surrogate.
+        value_weight: weight of the value loss.
+        max_gradient_norm: global norm to which gradients are clipped.
+        reward_scale: factor on all rewards.
+        shaping: factor on the shaped reward at the start, falling linearly to 0.
+        shaping_until: progress, 0 to 1, at which the shaped reward has gone.
+        confined_until: progress up to which the ego is held to its role.
+    """
+
+    total_steps: int = 1_000_000
+    num_envs: int = 32
+    rollout_steps: int = 50
+    epochs: int = 4
+    num_minibatches: int = 4
+    learning_rate: float = 1e-3
+    final_learning_rate: float = 5e-5
+    entropy: float = 0.02
+    final_entropy: float = 0.002
+    discount: float = 0.99
+    gae_lambda: float = 0.95
+    clip: float = 0.2
+    value_weight: float = 0.5
+    max_gradient_norm: float = 0.5
+    reward_scale: float = 0.1
+    shaping: float = 1.0
+    shaping_until: float = 0.7
+    confined_until: float = 0.55
+
+    def __post_init__(self):
+        if self.num_envs % self.num_minibatches:
+            raise ValueError(
+                f"num_minibatches is {self.num_minibatches}; expected a divisor of "
+                f"num_envs = {self.num_envs}"
+            )
+        if self.total_steps < self.num_envs * self.rollout_steps:
+            raise ValueError(
+                f"total_steps is {self.total_steps}; expected at least one batch of "
+                f"num_envs x rollout_steps = {self.num_envs * self.rollout_steps}"
+            )
+
+    @property
+    def steps_per_update(self) -> int:
+        """Environment steps of one pair in one update."""
+        return self.num_envs * self.rollout_steps
+
+    @property
+    def num_updates(self) -> int:
+        """Updates of a whole run."""
+        return self.total_steps // self.steps_per_update
+
+
+class Learner(PyTreeNode):
+    """A player that learns: parameters of its actor and critic, and the optimiser's state."""
+
+    actor: Policy
+    critic: Any
+    optimizer_state: Any
+
+
+class TrainState(PyTreeNode):
+    """Everything that training one pair needs to go on.
+
+    Attributes:
+        update: updates done, int32 [].
+        key: never consumed; folded with `update`.
+        ego: the ego's learner.
+        partner: the partner's learner, or frozen actors with leading axis [partner].
+        env_states: states of the games, leading axis [env].
+        observations: `Pair` of [env, O].
+    """
+
+    update: jax.Array
+    key: jax.Array
+    ego: Learner
+    partner: Learner | Policy
+    env_states: Any
+    observations: Pair
+
+
+class Batch(PyTreeNode):
+    """One player's experience; leading axes [T, env]."""
+
+    observation: jax.Array
+    action: jax.Array
+    log_prob: jax.Array
+    value: jax.Array
+    advantage: jax.Array
+    target: jax.Array
+
+
+def generalised_advantages(
+    rewards: jax.Array,
+    values: jax.Array,
+    last_value: jax.Array,
+    ended: jax.Array,
+    discount: float,
+    gae_lambda: float,
+) -> jax.Array:
+    """Generalised advantage estimates (Schulman et al., 2016, Eq. 16).
+
+    Args:
+        rewards: r_t, [T, ...].
+        values: V(s_t), [T, ...].
+        last_value: V(s_T), [...].
+        ended: whether the game ended with step t; nothing is carried over, bool [T, ...].
+        discount: γ.
+        gae_lambda: λ.
+
+    Returns:
+        [T, ...].
+    """
+    following = jnp.concatenate([values[1:], last_value[None]])
+    going_on = 1.0 - ended
+    errors = rewards + discount * following * going_on - values
+
+    def backwards(advantage, step):
+        error, on = step
+        advantage = error + discount * gae_lambda * on * advantage
+        return advantage, advantage
+
+    start = jnp.zeros_like(last_value)
+    return jax.lax.scan(backwards, start, (errors, going_on), reverse=True)[1]
+
+
+def ppo_loss(
+    params: tuple[Policy, Any],
+    batch: Batch,
+    actor: MLPActor,
+    critic: MLPCritic,
+    config: PPOConfig,
+    entropy_weight: jax.Array,
+) -> jax.Array:
+    """Clipped surrogate, clipped value loss and entropy bonus, mean over the batch.
+
+    Schulman et al. (2017), Eq. 7 and 9; advantages are normalised over the minibatch.
+    """
+    actor_params, critic_params = params
+    distribution = actor.apply(actor_params, batch.observation)
+    value = critic.apply(critic_params, batch.observation)
+    advantage = batch.advantage - jnp.mean(batch.advantage)
+    advantage = advantage / (jnp.std(batch.advantage) + 1e-8)
+    ratio = jnp.exp(networks.log_prob(distribution, batch.action) - batch.log_prob)
+    clipped_ratio = jnp.clip(ratio, 1 - config.clip, 1 + config.clip)
+    policy_loss = -jnp.mean(jnp.minimum(ratio * advantage, clipped_ratio * advantage))
+    clipped_value = batch.value + jnp.clip(value - batch.value, -config.clip, config.clip)
+    error = jnp.maximum((value - batch.target) ** 2, (clipped_value - batch.target) ** 2)
+    value_loss = 0.5 * jnp.mean(error)
+    entropy = jnp.mean(networks.entropy(distribution))
+    return policy_loss + config.value_weight * value_loss - entropy_weight * entropy
+
+
+def make_networks(env: Environment) -> tuple[Pair, MLPCritic]:
+    """Returns the actors of both players and the critic that either uses."""
+    return Pair(*(MLPActor(actions) for actions in env.num_actions)), MLPCritic()
+
+
+def make_optimizer(config: PPOConfig) -> optax.GradientTransformation:
+    """Adam on clipped gradients; the learning rate is applied by the caller."""
+    return optax.chain(
+        optax.clip_by_global_norm(config.max_gradient_norm), optax.scale_by_adam(eps=1e-5)
+    )
+
+
+def init_learner(
+    key: jax.Array, actor: MLPActor, critic: MLPCritic, size: int, config: PPOConfig
+) -> Learner:
+    """Returns a fresh learner for observations of a size; consumes `key`."""
+    actor_key, critic_key = jax.random.split(key)
+    observation = jnp.zeros(size)
+    return learner_from(
+        actor.init(actor_key, observation), critic.init(critic_key, observation), config
+    )
+
+
+def learner_from(actor: Policy, critic: Any, config: PPOConfig) -> Learner:
+    """Returns a learner that starts from given parameters."""
+    return Learner(actor, critic, make_optimizer(config).init((actor, critic)))
+
+
+def init_train_state(
+    env: Environment,
+    config: PPOConfig,
+    key: jax.Array,
+    ego: Learner,
+    partner: Learner | Policy,
+    style: Any,
+) -> TrainState:
+    """Starts the games of one pair; `key` is consumed here and by the training."""
+    reset_key, train_key = jax.random.split(key)
+    keys = jax.random.split(reset_key, config.num_envs)
+    states, timesteps = jax.vmap(env.training_reset, in_axes=(0, None))(keys, style)
+    return TrainState(
+        update=jnp.zeros((), jnp.int32),
+        key=train_key,
+        ego=ego,
+        partner=partner,
+        env_states=states,
+        observations=timesteps.observation,
+    )
+
+
+def train_chunk(
+    env: Environment, config: PPOConfig, num_updates: int, state: TrainState, style: Any
+) -> tuple[TrainState, dict[str, jax.Array]]:
+    """Advances one pair.
+
+    Args:
+        env: the environment.
+        config: settings; `config.num_updates` is the length of the schedules.
+        num_updates: updates to do.
+        state: where training stands.
+        style: the partner's style.
+
+    Returns:
+        The new state, and metrics of each update, float32 [num_updates]: `reward`, team
+        reward a step; `shaped`, the mean shaped reward a step; `loss`, the ego's mean loss.
+    """
+
+    def one_update(state: TrainState, _: None):
+        return _update(env, config, state, style)
+
+    return jax.lax.scan(one_update, state, None, length=num_updates)
+
+
+def _update(
+    env: Environment, config: PPOConfig, state: TrainState, style: Any
+) -> tuple[TrainState, dict[str, jax.Array]]:
+    """One rollout and the learning from it."""
+    progress = state.update / config.num_updates
+    rollout_key, learn_key = jax.random.split(jax.random.fold_in(state.key, state.update))
+    confined = env.confine(style)
+    bound = progress < config.confined_until
+    style_now = jax.tree.map(lambda held, free: jnp.where(bound, held, free), confined, style)
+    state, steps = _rollout(env, config, state, style_now, rollout_key)
+
+    actors, critic = make_networks(env)
+    shaping = config.shaping * jnp.maximum(0.0, 1 - progress / config.shaping_until)
+    scaled = config.reward_scale * (steps["reward"] + shaping * jnp.moveaxis(steps["shaped"], -1, 0))
+    rates = {
+        "learning_rate": _falling(config.learning_rate, config.final_learning_rate, progress),
+        "entropy_weight": _falling(config.entropy, config.final_entropy, progress),
+    }
+    keys = jax.random.split(learn_key)
+    losses = []
+    for agent, role in enumerate(("ego", "partner")):
+        learner = getattr(state, role)
+        if not isinstance(learner, Learner):
+            continue
+        actor = actors[agent]
+        batch = _make_batch(
+            config, actor, critic, learner, steps, state.observations[agent], agent, scaled[agent]
+        )
+        learner, loss = _learn(config, actor, critic, learner, batch, keys[agent], **rates)
+        state = state.replace(**{role: learner})
+        losses.append(loss)
+    metrics = {
+        "reward": jnp.mean(steps["reward"]),
+        "shaped": jnp.mean(steps["shaped"]),
+        "loss": jnp.mean(jnp.stack(losses)),
+    }
+    return state.replace(update=state.update + 1), metrics
+
+
+def _falling(start: float, end: float, progress: jax.Array) -> jax.Array:
+    return start + (end - start) * progress
+
+
+def _rollout(
+    env: Environment, config: PPOConfig, state: TrainState, style: Any, key: jax.Array
+) -> tuple[TrainState, dict[str, Any]]:
+    """Plays `rollout_steps` steps of all games; finished games start anew."""
+    actors, _ = make_networks(env)
+    ego = partial(actors.ego.apply, state.ego.actor)
+    if isinstance(state.partner, Learner):
+        partner = partial(actors.partner.apply, state.partner.actor)
+    else:
+        partner = partial(_frozen_partners, actors.partner, state.partner)
+
+    def one_step(carry, step_key):
+        states, observations = carry
+        ego_key, partner_key, env_key, reset_key = jax.random.split(step_key, 4)
+        distributions = Pair(ego(observations.ego), partner(observations.partner))
+        actions = Pair(
+            networks.sample(ego_key, distributions.ego),
+            networks.sample(partner_key, distributions.partner),
+        )
+        log_probs = jax.tree.map(networks.log_prob, distributions, actions)
+        keys = jax.random.split(env_key, config.num_envs)
+        following, timesteps = jax.vmap(env.step, in_axes=(0, 0, 0, None))(
+            keys, states, actions, style
+        )
+        keys = jax.random.split(reset_key, config.num_envs)
+        fresh, first = jax.vmap(env.training_reset, in_axes=(0, None))(keys, style)
+        done = timesteps.done
+
+        def restart(new, old):
+            return jnp.where(done.reshape(-1, *[1] * (old.ndim - 1)), new, old)
+
+        kept = {
+            "observations": observations,
+            "actions": actions,
+            "log_probs": log_probs,
+            "reward": timesteps.reward,
+            "shaped": timesteps.shaped_reward,
+            "ended": done,
+        }
+        states = jax.tree.map(restart, fresh, following)
+        observations = jax.tree.map(restart, first.observation, timesteps.observation)
+        return (states, observations), kept
+
+    carry = (state.env_states, state.observations)
+    (env_states, observations), steps = jax.lax.scan(
+        one_step, carry, jax.random.split(key, config.rollout_steps)
+    )
+    return state.replace(env_states=env_states, observations=observations), steps
+
+
+def _frozen_partners(actor: MLPActor, policies: Policy, observation: jax.Array) -> Any:
+    """Each of the frozen partners plays an equal share of the games."""
+    num_partners = jax.tree.leaves(policies)[0].shape[0]
+    shared = observation.reshape(num_partners, -1, observation.shape[-1])
+    distributions = jax.vmap(actor.apply)(policies, shared)
+    return jax.tree.map(lambda leaf: leaf.reshape(-1, leaf.shape[-1]), distributions)
+
+
+def _make_batch(
+    config: PPOConfig,
+    actor: MLPActor,
+    critic: MLPCritic,
+    learner: Learner,
+    steps: dict[str, Any],
+    last_observation: jax.Array,
+    agent: int,
+    rewards: jax.Array,
+) -> Batch:
+    """Values and advantages of one player's experience."""
+    del actor
+    observation = steps["observations"][agent]
+    everything = jnp.concatenate([observation, last_observation[None]])
+    values = critic.apply(learner.critic, everything)
+    advantage = generalised_advantages(
+        rewards, values[:-1], values[-1], steps["ended"], config.discount, config.gae_lambda
+    )
+    return Batch(
+        observation=observation,
+        action=steps["actions"][agent],
+        log_prob=steps["log_probs"][agent],
+        value=values[:-1],
+        advantage=advantage,
+        target=advantage + values[:-1],
+    )
+
+
+def _learn(
+    config: PPOConfig,
+    actor: MLPActor,
+    critic: MLPCritic,
+    learner: Learner,
+    batch: Batch,
+    key: jax.Array,
+    *,
+    learning_rate: jax.Array,
+    entropy_weight: jax.Array,
+) -> tuple[Learner, jax.Array]:
+    """Some passes over the batch, in minibatches of whole games."""
+    optimizer = make_optimizer(config)
+    size = config.num_envs // config.num_minibatches
+    # Whole games in a minibatch: gathering them copies long rows, and no sort is needed.
+    by_game = jax.tree.map(lambda leaf: jnp.swapaxes(leaf, 0, 1), batch)
+
+    def one_step(carry, games):
+        params, optimizer_state = carry
+        minibatch = jax.tree.map(lambda leaf: leaf[games], by_game)
+        minibatch = jax.tree.map(lambda leaf: leaf.reshape(-1, *leaf.shape[2:]), minibatch)
+        loss, gradient = jax.value_and_grad(ppo_loss)(
+            params, minibatch, actor, critic, config, entropy_weight
+        )
+        updates, optimizer_state = optimizer.update(gradient, optimizer_state)
+        params = jax.tree.map(lambda p, u: p - learning_rate * u, params, updates)
+        return (params, optimizer_state), loss
+
+    orders = jax.vmap(lambda k: jax.random.permutation(k, config.num_envs))(
+        jax.random.split(key, config.epochs)
+    )
+    carry = ((learner.actor, learner.critic), learner.optimizer_state)
+    (params, optimizer_state), losses = jax.lax.scan(
+        one_step, carry, orders.reshape(config.epochs * config.num_minibatches, size)
+    )
+    return Learner(*params, optimizer_state), jnp.mean(losses)
