@@ -1,0 +1,282 @@
+"""The figures of a run, drawn from results.json alone, each as PNG and PDF."""
+
+from collections.abc import Callable, Mapping, Sequence
+from pathlib import Path
+from typing import Any
+
+import matplotlib
+import numpy as np
+from matplotlib.axes import Axes
+from matplotlib.backends.backend_agg import FigureCanvasAgg
+from matplotlib.figure import Figure
+
+from experiments.summary import HEADLINE, METHODS, ORACLE, WRONG, mean, ratios, returns, spread
+from experiments.summary import ordered_methods as methods_of
+
+_DOTS_PER_INCH = 150
+_TARGET = 0.95
+_STYLE: dict[Any, Any] = {
+    "font.size": 9,
+    "font.family": "DejaVu Sans",
+    "axes.titlesize": 9,
+    "axes.labelsize": 9,
+    "legend.fontsize": 8.5,
+    "xtick.labelsize": 8.5,
+    "ytick.labelsize": 8.5,
+    "axes.spines.top": False,
+    "axes.spines.right": False,
+    "axes.linewidth": 0.8,
+    "hatch.linewidth": 0.6,
+    "pdf.fonttype": 42,
+}
+# Colours that differ in lightness as well, so that they survive a grey print.
+_FILLS = {
+    ORACLE: ("#575757", ""),
+    "Best response": ("#8a8a8a", ""),
+    "VAE reconstruction": ("#b8b8b8", ""),
+    "Diffusion, true task language": ("#e2e2e2", ""),
+    "Haland, training sentences": ("#8fc1e3", ""),
+    HEADLINE: ("#2a6cb6", ""),
+    WRONG: ("#ffffff", "////"),
+}
+_OTHER_FILLS = (
+    ("#e8b96a", ""),
+    ("#b5651d", ""),
+    ("#f6e3c0", ".."),
+    ("#c9d8c0", ""),
+    ("#6f8f6b", ""),
+    ("#e6efe2", "xx"),
+    ("#c3a6cf", ""),
+)
+
+
+def draw_figures(results: Mapping[str, Any], folder: str | Path) -> list[Path]:
+    """Draws every figure whose numbers are there.
+
+    Args:
+        results: the content of results.json.
+        folder: where `<name>.png` and `<name>.pdf` go; made if it is missing.
+
+    Returns:
+        The PNG files, in the order of the report.
+    """
+    folder = Path(folder)
+    folder.mkdir(parents=True, exist_ok=True)
+    drawn = []
+    for name, (needed, draw) in FIGURES.items():
+        if any(key not in results for key in needed):
+            continue
+        with matplotlib.rc_context(_STYLE):
+            figure = draw(results)
+            if figure is None:
+                continue
+            figure.savefig(folder / f"{name}.png", dpi=_DOTS_PER_INCH)
+            figure.savefig(folder / f"{name}.pdf", metadata={"CreationDate": None})
+        drawn.append(folder / f"{name}.png")
+    return drawn
+
+
+def share_of_oracle(results: Mapping[str, Any]) -> Figure:
+    """Return divided by the Oracle's, a bar a method, a dot a held-out seed."""
+    methods = methods_of(results)
+    figure = _figure(7.2, 0.9 + 0.32 * len(methods))
+    axes = figure.add_subplot()
+    fills = _fills(methods)
+    for row, method in enumerate(methods):
+        by_seed = np.asarray([mean(column) for column in ratios(results, method).T])
+        centre = mean(ratios(results, method))
+        colour, hatch = fills[method]
+        axes.barh(row, centre, 0.72, color=colour, hatch=hatch, edgecolor="black", linewidth=0.6)
+        offsets = np.linspace(-0.2, 0.2, by_seed.size) if by_seed.size > 1 else np.zeros(1)
+        axes.plot(
+            by_seed, row + offsets, "o", markersize=3, color="white", markeredgecolor="black",
+            markeredgewidth=0.6, linestyle="none",
+        )  # fmt: skip
+        label = "–" if np.isnan(centre) else f"{centre:.2f} ± {spread(by_seed):.2f}"
+        axes.text(1.02, row, label, transform=axes.get_yaxis_transform(), va="center")
+    axes.axvline(_TARGET, color="#c02020", linewidth=1.0, linestyle="--")
+    axes.text(_TARGET, -0.62, f"aim {_TARGET}", ha="center", va="bottom", fontsize=8)
+    axes.set_yticks(range(len(methods)), methods)
+    axes.set_ylim(len(methods) - 0.45, -0.62)
+    axes.set_xlim(left=min(0.0, axes.get_xlim()[0]))
+    axes.tick_params(axis="y", length=0)
+    axes.set_xlabel("return / Oracle (mean over styles; dots: held-out seeds)")
+    return figure
+
+
+def returns_by_style(results: Mapping[str, Any]) -> Figure:
+    """Bars of the return by style, one for each step from the Oracle to Haland."""
+    return _grouped_bars(results, [name for name in methods_of(results) if name in METHODS])
+
+
+def comparisons_by_style(results: Mapping[str, Any]) -> Figure | None:
+    """Bars of the return by style: Haland beside the ablations and baselines, if there are any."""
+    others = [name for name in methods_of(results) if name not in METHODS]
+    ours = [name for name in (ORACLE, HEADLINE) if name in methods_of(results)]
+    return _grouped_bars(results, [*ours, *others]) if others else None
+
+
+def learning_curves(results: Mapping[str, Any]) -> Figure:
+    """Return in training, a panel a style: each seed, their mean, one standard deviation."""
+    steps = np.asarray(results["curves"]["steps"], float)
+    curves = results["curves"]["returns"]
+    columns = min(4, len(curves))
+    rows = -(-len(curves) // columns)
+    figure = _figure(2.3 * columns + 0.5, 1.75 * rows + 0.45)
+    grid = figure.subplots(rows, columns, sharex=True, sharey=True, squeeze=False)
+    scale, unit = (1e6, " (millions)") if steps.max() >= 1e6 else (1e3, " (thousands)")
+    for axes, (style, seeds) in zip(grid.flat, curves.items(), strict=False):
+        seeds = np.asarray(seeds, float)
+        centre = seeds.mean(axis=0)
+        half = seeds.std(axis=0, ddof=1) if len(seeds) > 1 else np.zeros_like(centre)
+        axes.fill_between(
+            steps / scale, centre - half, centre + half, color="#8fc1e3", alpha=0.6, linewidth=0
+        )
+        axes.plot(steps / scale, seeds.T, color="#6d6d6d", linewidth=0.5, alpha=0.7)
+        axes.plot(steps / scale, centre, color="#1f5fa8", linewidth=1.6)
+        axes.set_title(_words(style))
+        axes.grid(axis="y", color="#dddddd", linewidth=0.6)
+        axes.margins(x=0.01)
+    for axes in list(grid.flat)[len(curves) :]:
+        axes.remove()
+    figure.supxlabel(f"environment steps{unit}", fontsize=9)
+    figure.supylabel("return per episode", fontsize=9)
+    return figure
+
+
+def task_language(results: Mapping[str, Any]) -> Figure:
+    """Normalised event frequencies by style; a panel for each player that the events name."""
+    events = results["task_language"]["events"]
+    frequencies = np.asarray(results["task_language"]["v_hat"], float)  # [style, U]
+    players = list(dict.fromkeys(_player(event) for event in events))
+    columns = {
+        player: [index for index, event in enumerate(events) if _player(event) == player]
+        for player in players
+    }
+    tallest = max(len(indices) for indices in columns.values())
+    width = 1.9 + 0.3 * len(results["styles"])
+    figure = _figure(width * len(players) + 0.8, 1.5 + 0.19 * tallest)
+    grid = figure.subplots(1, len(players), squeeze=False)[0]
+    image = None
+    for axes, player in zip(grid, players, strict=True):
+        indices = columns[player]
+        image = axes.imshow(
+            frequencies[:, indices].T, cmap="Blues", vmin=0, vmax=1, aspect="auto"
+        )  # fmt: skip
+        names = [_words(events[index].partition(":")[2] or events[index]) for index in indices]
+        axes.set_yticks(range(len(indices)), names, fontsize=7.5)
+        _label_styles(axes, results["styles"])
+        _draw_cell_borders(axes, len(indices), len(results["styles"]))
+        if player:
+            axes.set_title(f"events of the {player}")
+    if image is not None:
+        bar = figure.colorbar(image, ax=list(grid), shrink=0.6, aspect=25, pad=0.02)
+        bar.set_label("normalised frequency")
+        bar.outline.set_linewidth(0.6)  # pyright: ignore[reportCallIssue]
+    return figure
+
+
+def cross_play(results: Mapping[str, Any]) -> Figure:
+    """Return of the best responses of each style with partners of each style."""
+    values = np.asarray(results["cross_play"], float)
+    styles = results["styles"]
+    figure = _figure(2.4 + 0.55 * len(styles), 1.9 + 0.42 * len(styles))
+    axes = figure.add_subplot()
+    lowest, highest = min(0.0, values.min()), values.max()
+    image = axes.imshow(values, cmap="Blues", vmin=lowest, vmax=highest, aspect="auto")
+    for (row, column), value in np.ndenumerate(values):
+        axes.text(
+            column, row, f"{value:.0f}", ha="center", va="center", fontsize=8,
+            color="white" if value > lowest + 0.6 * (highest - lowest) else "black",
+            fontweight="bold" if row == column else "normal",
+        )  # fmt: skip
+    axes.set_yticks(range(len(styles)), [_words(style) for style in styles])
+    _label_styles(axes, styles)
+    _draw_cell_borders(axes, *values.shape)
+    axes.set_ylabel("ego trained for")
+    axes.set_xlabel("partner's style")
+    figure.colorbar(image, ax=axes, shrink=0.8, aspect=25, pad=0.02).set_label("return per episode")
+    return figure
+
+
+def _grouped_bars(results: Mapping[str, Any], methods: Sequence[str]) -> Figure:
+    styles = results["styles"]
+    figure = _figure(max(6.0, 1.35 * len(styles)), 3.9)
+    axes = figure.add_subplot()
+    fills = _fills(methods)
+    width = 0.84 / len(methods)
+    for index, method in enumerate(methods):
+        values = returns(results, method)  # [style, seed]
+        colour, hatch = fills[method]
+        axes.bar(
+            np.arange(len(styles)) + (index - (len(methods) - 1) / 2) * width, values.mean(axis=1),
+            width, yerr=[spread(row) for row in values], label=method, color=colour, hatch=hatch,
+            edgecolor="black", linewidth=0.5, ecolor="black",
+            error_kw={"elinewidth": 0.9, "capsize": 1.5},
+        )  # fmt: skip
+    axes.set_xticks(range(len(styles)), [_wrap(style) for style in styles])
+    axes.tick_params(axis="x", length=0)
+    axes.set_axisbelow(True)
+    axes.grid(axis="y", color="#dddddd", linewidth=0.6)
+    axes.margins(x=0.01)
+    axes.set_ylabel("return per episode")
+    figure.legend(loc="outside upper center", ncols=min(4, len(methods)), frameon=False)
+    return figure
+
+
+def _fills(methods: Sequence[str]) -> dict[str, tuple[str, str]]:
+    others = [name for name in methods if name not in _FILLS]
+    extra = {name: _OTHER_FILLS[i % len(_OTHER_FILLS)] for i, name in enumerate(others)}
+    return {name: _FILLS.get(name) or extra[name] for name in methods}
+
+
+def _figure(width: float, height: float) -> Figure:
+    """A figure, in inches, that no interactive session knows of."""
+    figure = Figure(figsize=(width, height), layout="constrained")
+    FigureCanvasAgg(figure)
+    return figure
+
+
+def _label_styles(axes: Axes, styles: Sequence[str]) -> None:
+    axes.set_xticks(range(len(styles)), [_words(style) for style in styles])
+    for label in axes.get_xticklabels():
+        label.set(rotation=40, ha="right", rotation_mode="anchor")
+
+
+def _draw_cell_borders(axes: Axes, rows: int, columns: int) -> None:
+    axes.set_xticks(np.arange(columns + 1) - 0.5, minor=True)
+    axes.set_yticks(np.arange(rows + 1) - 0.5, minor=True)
+    axes.grid(which="minor", color="white", linewidth=0.8)
+    axes.tick_params(which="both", length=0)
+    for spine in axes.spines.values():
+        spine.set_visible(False)
+
+
+def _player(event: str) -> str:
+    return event.partition(":")[0] if ":" in event else ""
+
+
+def _words(name: str) -> str:
+    return name.replace("_", " ").replace("@", " @ ")
+
+
+def _wrap(name: str) -> str:
+    """A style's name on as many lines as it needs under a group of bars."""
+    lines = [""]
+    for word in name.split("_"):
+        if lines[-1] and len(lines[-1]) + len(word) >= 14:
+            lines.append(word)
+        else:
+            lines[-1] = f"{lines[-1]} {word}".strip()
+    return "\n".join(lines)
+
+
+# Name of the file -> what of results.json it needs, and the function that draws it.
+FIGURES: dict[str, tuple[tuple[str, ...], Callable[[Mapping[str, Any]], Figure | None]]] = {
+    "share_of_oracle": (("methods", "oracle"), share_of_oracle),
+    "returns_by_style": (("methods", "oracle"), returns_by_style),
+    "comparisons_by_style": (("methods", "oracle"), comparisons_by_style),
+    "cross_play": (("cross_play",), cross_play),
+    "learning_curves": (("curves",), learning_curves),
+    "task_language": (("task_language",), task_language),
+}

@@ -1,0 +1,267 @@
+"""The run's report for a reader who was not there, and its summary for the terminal."""
+
+from collections.abc import Iterable, Mapping, Sequence
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from rich.table import Table
+
+from experiments.figures import draw_figures
+from experiments.summary import (
+    HEADLINE,
+    METHODS,
+    ORACLE,
+    WRONG,
+    MethodSummary,
+    dead_partners,
+    mean,
+    ordered_methods,
+    ratios,
+    returns,
+    spread,
+    summarise,
+)
+
+_AIM = 0.95
+_MEANING = {
+    ORACLE: "the best of several egos refitted to that very partner: the upper bound",
+    "Best response": "the archived egos of the same style, which never met these partners: the "
+    "ceiling of all below",
+    "VAE reconstruction": "the same egos after encoding and decoding",
+    "Diffusion, true task language": "policies drawn from the diffusion model, given the measured "
+    "event frequencies",
+    "Haland, training sentences": "policies from sentences that the translator was trained on",
+    HEADLINE: "policies from sentences never seen, one sample each: **the headline**",
+    WRONG: "policies from another style's sentence: the control, which must fall",
+}
+_CAPTIONS = {
+    "share_of_oracle": "Return divided by the Oracle's, with the standard deviation over held-out "
+    "seeds.\nEach dot is one held-out seed, averaged over the styles.",
+    "returns_by_style": "Return with held-out partners by style; error bars are standard "
+    "deviations over seeds.\nEach bar adds one step of the method: what a bar loses to the one "
+    "on its left is that step's cost.",
+    "comparisons_by_style": "The same for the baselines and ablations, beside the Oracle and "
+    "Haland.\nA baseline as tall as Haland means that in this style the sentence was not needed.",
+    "cross_play": "Best responses of each style with partners of every style.\nA dark diagonal "
+    "means that knowing the partner's style pays; an even row means an ego that suits everyone.",
+    "learning_curves": "Return in training: each seed (grey), their mean and one standard "
+    "deviation.\nA curve that stays low is a partner that did not learn, and makes an Oracle that "
+    "says little.",
+    "task_language": "Normalised event frequencies, from which Eq. 8 makes the task language.\n"
+    "Two columns that look alike are two styles that the diffusion model cannot tell apart.",
+}
+
+
+def write_report(results: Mapping[str, Any], folder: str | Path) -> Path:
+    """Draws the figures into `folder`/figures and writes `folder`/report.md.
+
+    Args:
+        results: the content of results.json; the parts that it lacks are left out. Further
+            methods may be described in its "descriptions", {method: text}.
+        folder: the run's folder. Recordings in figures/episodes/<style>.gif are shown as well.
+
+    Returns:
+        The report's path.
+
+    Raises:
+        UserError: the results contradict themselves, such as a method without one of the styles.
+    """
+    folder = Path(folder)
+    figures = draw_figures(results, folder / "figures")
+    sections = [
+        _opening(results),
+        _headline(results),
+        _gates(results),
+        _by_style(results),
+        _translator(results),
+        _memorisation(results),
+        _figures(figures),
+        _episodes(results, folder),
+        _costs(results),
+    ]
+    report = folder / "report.md"
+    writing = report.with_name(".report.md.writing")
+    writing.write_text("\n\n".join(filter(None, sections)) + "\n", encoding="utf-8")
+    writing.replace(report)
+    return report
+
+
+def summary_table(results: Mapping[str, Any]) -> Table:
+    """The headline table for the terminal."""
+    table = Table(
+        title=f"{results['environment']}, preset {results['preset']}", title_justify="left"
+    )
+    table.add_column("method")
+    for name in ("return", "of the Oracle", "episodes"):
+        table.add_column(name, justify="right")
+    for row in summarise(results):
+        style = "bold" if row.method == HEADLINE else ""
+        table.add_row(row.method, *_numbers(row), style=style)
+    for name, gate in results.get("gates", {}).items():
+        verdict = "[green]met[/]" if gate["met"] else "[red]missed[/]"
+        table.add_row(f"gate: {name}", _number(gate["value"]), f"≥ {_number(gate['bar'])}", verdict)
+    return table
+
+
+def _opening(results: Mapping[str, Any]) -> str:
+    seeds = returns(results, ORACLE).shape[1]
+    return (
+        f"# {results['environment']}, preset `{results['preset']}`, seed {results['seed']}\n\n"
+        f"{_verdict(results)}\n\n"
+        f"All returns are with held-out partners, {len(results['styles'])} styles × {seeds} seeds, "
+        "that no learnt part has met; only the Oracle was fitted to them."
+    )
+
+
+def _verdict(results: Mapping[str, Any]) -> str:
+    """The finding in two or three sentences, good or bad."""
+    rows = {row.method: row for row in summarise(results)}
+    if HEADLINE not in rows or np.isnan(rows[HEADLINE].ratio):
+        return "Haland was not measured from test sentences in this run."
+    headline = rows[HEADLINE]
+    reached = "reaches the aim of" if headline.ratio >= _AIM else "misses the aim of"
+    said = [
+        f"From sentences never seen, Haland earns **{headline.ratio:.0%} of the Oracle** "
+        f"({_with_spread(headline.mean, headline.std)} per episode): it {reached} {_AIM:.0%}."
+    ]
+    if "Best response" in rows and rows["Best response"].ratio > 0:
+        ceiling = rows["Best response"].ratio
+        said.append(
+            f"Its ceiling, the archived best responses, is at {ceiling:.0%}, of which Haland "
+            f"keeps {headline.ratio / ceiling:.0%}."
+        )
+    if WRONG in rows:
+        fall = headline.ratio - rows[WRONG].ratio
+        judgement = "the sentence matters" if fall > 0.1 else "the sentence hardly matters here"
+        said.append(f"With a wrong sentence it earns {rows[WRONG].ratio:.0%}: {judgement}.")
+    missed = [name for name, gate in results.get("gates", {}).items() if not gate["met"]]
+    if missed:
+        said.append(f"**Gates missed: {'; '.join(missed)}.**")
+    return " ".join(said)
+
+
+def _headline(results: Mapping[str, Any]) -> str:
+    meaning = {**_MEANING, **results.get("descriptions", {})}
+    rows = [(row.method, *_numbers(row), meaning.get(row.method, "")) for row in summarise(results)]
+    head = ("method", "return", "return / Oracle", "episodes", "what it is")
+    table = _table(head, rows, "lrrrl")
+    note = (
+        "Mean ± sample standard deviation over the held-out seeds, of each seed's mean over "
+        "styles. The ratio divides each partner's return by that partner's own Oracle."
+    )
+    if dead := dead_partners(results):
+        note += (
+            f" **Left out of the ratio: {dead} held-out partners whose Oracle is zero or less.**"
+        )
+    return f"## Returns\n\n{table}\n\n{note}"
+
+
+def _gates(results: Mapping[str, Any]) -> str:
+    if not results.get("gates"):
+        return ""
+    rows = [
+        (name, _number(gate["value"]), _number(gate["bar"]), "met" if gate["met"] else "**missed**")
+        for name, gate in results["gates"].items()
+    ]
+    return (
+        f"## Gates\n\n{_table(('gate', 'value', 'bar', ''), rows, 'lrrl')}\n\n"
+        "A gate is checked before the next stage builds on its stage.\nA missed one bounds "
+        "everything after it, however well that was trained."
+    )
+
+
+def _by_style(results: Mapping[str, Any]) -> str:
+    methods = [name for name in ordered_methods(results) if name in METHODS]
+    tables = {name: (returns(results, name), ratios(results, name)) for name in methods}
+    rows = []
+    for index, style in enumerate(results["styles"]):
+        cells = []
+        for method, (values, shares) in tables.items():
+            share = mean(shares[index])
+            of_oracle = "" if method == ORACLE or np.isnan(share) else f" ({share:.2f})"
+            cells.append(_with_spread(values[index].mean(), spread(values[index])) + of_oracle)
+        rows.append((style.replace("_", " "), *cells))
+    table = _table(("style", *methods), rows, "l" + "r" * len(methods))
+    note = "Return ± deviation over seeds; in brackets the share of the Oracle."
+    return f"## By style\n\n{table}\n\n{note}"
+
+
+def _translator(results: Mapping[str, Any]) -> str:
+    if not (translator := results.get("translator")):
+        return ""
+    text = (
+        f"## Translator\n\n{translator['accuracy']:.0%} of the test sentences are translated "
+        "into their own style rather than another."
+    )
+    by_style = translator.get("by_style", {})
+    imperfect = [
+        f"{style.replace('_', ' ')} {share:.0%}" for style, share in by_style.items() if share < 1
+    ]
+    if imperfect:
+        text += f"\nStyles with mistakes: {', '.join(imperfect)}."
+    return text
+
+
+def _memorisation(results: Mapping[str, Any]) -> str:
+    if not (measured := results.get("memorisation")):
+        return ""
+    rows = [(name.replace("_", " "), _number(value)) for name, value in measured.items()]
+    return (
+        f"## Memorisation\n\n{_table(('measure', 'value'), rows, 'lr')}\n\n"
+        "How far generated latents are from the nearest training latent.\nFar less than training "
+        "latents are from each other means that policies are copied, not generated."
+    )
+
+
+def _figures(figures: Iterable[Path]) -> str:
+    shown = [
+        f"![{file.stem.replace('_', ' ')}](figures/{file.name})\n\n{_CAPTIONS[file.stem]}"
+        for file in figures
+    ]
+    return "## Figures\n\n" + "\n\n".join(shown) if shown else ""
+
+
+def _episodes(results: Mapping[str, Any], folder: Path) -> str:
+    recorded = [
+        (style.replace("_", " "), f"![{style}](figures/episodes/{style}.gif)")
+        for style in results["styles"]
+        if (folder / "figures" / "episodes" / f"{style}.gif").is_file()
+    ]
+    if not recorded:
+        return ""
+    table = _table(("style", "episode"), recorded, "ll")
+    return f"## Episodes\n\nGenerated egos with held-out partners.\n\n{table}"
+
+
+def _costs(results: Mapping[str, Any]) -> str:
+    parts = []
+    if times := results.get("times"):
+        rows = [(stage.replace("_", " "), f"{seconds:,.1f}") for stage, seconds in times.items()]
+        rows.append(("**all**", f"**{sum(times.values()):,.1f}**"))
+        parts.append("## Time\n\n" + _table(("stage", "seconds"), rows, "lr"))
+    if machine := results.get("machine"):
+        rows = [(name.replace("_", " "), str(value)) for name, value in machine.items()]
+        parts.append("## Machine\n\n" + _table(("", ""), rows, "ll"))
+    return "\n\n".join(parts)
+
+
+def _numbers(row: MethodSummary) -> tuple[str, str, str]:
+    count = "–" if row.episodes is None else f"{row.episodes:,}"
+    ratio = "–" if np.isnan(row.ratio) else f"{row.ratio:.3f} ± {row.ratio_std:.3f}"
+    return _with_spread(row.mean, row.std), ratio, count
+
+
+def _with_spread(centre: float, deviation: float) -> str:
+    return f"{centre:.1f} ± {deviation:.1f}"
+
+
+def _number(value: Any) -> str:
+    return f"{value:.3g}" if isinstance(value, float) else str(value)
+
+
+def _table(head: Sequence[str], rows: Iterable[Sequence[str]], alignment: str) -> str:
+    """A Markdown table; alignment has a letter a column, l or r."""
+    rule = ["---:" if letter == "r" else "---" for letter in alignment]
+    lines = [head, rule, *rows]
+    return "\n".join(f"| {' | '.join(cell.replace('|', '¦') for cell in line)} |" for line in lines)
