@@ -137,8 +137,10 @@ def learning_curves(results: Mapping[str, Any]) -> Figure:
         axes.set_title(_words(style))
         axes.grid(axis="y", color="#dddddd", linewidth=0.6)
         axes.margins(x=0.01)
-    for axes in list(grid.flat)[len(curves) :]:
-        axes.remove()
+    for axes, above in zip(grid[-1], grid[-2] if rows > 1 else grid[-1], strict=True):
+        if not axes.has_data():
+            above.tick_params(labelbottom=True)
+            axes.remove()
     figure.supxlabel(f"environment steps{unit}", fontsize=9)
     figure.supylabel("return per episode", fontsize=9)
     return figure
