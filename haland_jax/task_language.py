@@ -98,7 +98,7 @@ def build_task_language(frequencies: Array, names: Sequence[str]) -> TaskLanguag
         )
     if not np.isfinite(values).all() or (values < 0).any():
         raise ValueError("frequencies has negative or non-finite entries; check the rollouts")
-    seen = (values > 0).any(axis=(0, 1))
+    seen = np.asarray((values > 0).any(axis=(0, 1)))
     if not seen.any():
         raise ValueError("frequencies are all zero; the partners never caused an event")
     kept = values[..., seen]

@@ -1,0 +1,397 @@
+"""Latent diffusion of policies, conditioned on the task language (Eq. 1, 2, 5; App. E.2).
+
+What is diffused is the standardised latent of the policy autoencoder, [D] = 64 numbers seen as a
+4x4 grid of 4 channels. Written unbatched; callers `vmap`. Noise steps are numbered 1 to N as in the
+paper, and an array's entry i - 1 belongs to step i.
+"""
+
+from collections.abc import Callable
+from dataclasses import dataclass, field
+from functools import partial
+from typing import Any
+
+import flax.linen as nn
+import jax
+import jax.numpy as jnp
+import numpy as np
+from flax.struct import PyTreeNode
+from jax import Array
+
+from haland_jax.fit import FitConfig, LossFn, SampleFn
+from haland_jax.task_language import BINS, jittered
+from haland_jax.unet import Conditioner, UNet, UNetConfig
+
+NoiseFn = Callable[[Array, Array], Array]
+"""(noisy latent [D], noise step []) -> predicted noise [D]."""
+
+PAPER_STEPS, PAPER_BETA = 1000, (1e-4, 0.02)
+
+
+@dataclass(frozen=True)
+class DiffusionConfig:
+    """Latent diffusion; sizes from Tables 2 and 3, the rest left open by the paper.
+
+    Attributes:
+        grid: height, width and channels that D factors into; 4x4x4 for Table 2's D = 64.
+        unet: widths of Table 3's UNet.
+        bins: V of Eq. 8 (App. D).
+        token_features: width d of a token's embedding.
+        noise_steps: N. Other values than 1000 rescale β so that the last step is as noisy.
+        ddim_steps: steps of the fast sampler, at most N.
+        eta: noise of the fast sampler, 0 none, 1 as much as Eq. 1.
+        clip: largest magnitude of the predicted standardised latent in DDIM; infinity clips none.
+        frequency_jitter: half-width of the uniform noise on the frequencies in training.
+        condition_dropout: share of training samples without a condition; needed for guidance.
+        guidance: classifier-free guidance weight; 1 is plain conditional sampling.
+        batch_size: samples of one step of the fit.
+        largest_weight: bound of the weight min(1 / ᾱ_i, bound) of a noise step in the loss; 1 is
+            Eq. 5 itself, a larger one pays more attention to the noisy steps, where a sample
+            settles for a style.
+        fit: optimiser and length of the fit.
+    """
+
+    grid: tuple[int, int, int] = (4, 4, 4)
+    unet: UNetConfig = field(default_factory=UNetConfig)
+    bins: int = BINS
+    token_features: int = 32
+    noise_steps: int = PAPER_STEPS
+    ddim_steps: int = 25
+    eta: float = 0.0
+    clip: float = float("inf")
+    frequency_jitter: float = 0.03
+    condition_dropout: float = 0.0
+    guidance: float = 1.0
+    batch_size: int = 64
+    largest_weight: float = 4.0
+    fit: FitConfig = field(
+        default_factory=lambda: FitConfig(
+            learning_rate=3e-3, steps=2000, warmup_steps=100, ema_decay=0.995
+        )
+    )
+
+    def __post_init__(self):
+        expected = {
+            "bins": (self.bins >= 2, ">= 2"),
+            "noise_steps": (self.noise_steps >= 10, ">= 10"),
+            "ddim_steps": (2 <= self.ddim_steps <= self.noise_steps, "in [2, noise_steps]"),
+            "eta": (0 <= self.eta <= 1, "in [0, 1]"),
+            "clip": (self.clip > 0, "> 0"),
+            "frequency_jitter": (0 <= self.frequency_jitter <= 1, "in [0, 1]"),
+            "condition_dropout": (0 <= self.condition_dropout < 1, "in [0, 1)"),
+            "guidance": (
+                self.guidance == 1 or self.condition_dropout > 0,
+                "1 unless condition_dropout > 0 trains the unconditional branch",
+            ),
+            "batch_size": (self.batch_size >= 1, ">= 1"),
+            "largest_weight": (self.largest_weight >= 1, ">= 1"),
+        }
+        for name, (valid, wanted) in expected.items():
+            if not valid:
+                raise ValueError(
+                    f"DiffusionConfig.{name} is {getattr(self, name)}; it has to be {wanted}"
+                )
+
+    @property
+    def latent_size(self) -> int:
+        """D, numbers in one latent."""
+        return int(np.prod(self.grid))
+
+
+class LatentArchive(PyTreeNode):
+    """What the diffusion is fitted on, one row a policy.
+
+    Attributes:
+        z_mean, z_log_variance: [P, D], the autoencoder's posterior.
+        v_hat: [P, U], the task language of each policy's style, in [0, 1].
+    """
+
+    z_mean: Array
+    z_log_variance: Array
+    v_hat: Array
+
+
+class LatentStatistics(PyTreeNode):
+    """Mean and standard deviation of every latent dimension over the archive, each [D]."""
+
+    mean: Array
+    std: Array
+
+    def standardise(self, z: Array) -> Array:
+        return (z - self.mean) / self.std
+
+    def restore(self, standardised: Array) -> Array:
+        return standardised * self.std + self.mean
+
+
+class DiffusionParams(PyTreeNode):
+    """A fitted diffusion: the noise predictor's (averaged) parameters and the statistics."""
+
+    network: Any
+    statistics: LatentStatistics
+
+
+def latent_statistics(archive: LatentArchive) -> LatentStatistics:
+    """Statistics of z over the archive: the variance between policies plus that within each.
+
+    Raises:
+        ValueError: a dimension does not vary at all or is not finite.
+    """
+    mean = np.asarray(archive.z_mean, np.float64)
+    within = np.exp(np.asarray(archive.z_log_variance, np.float64)).mean(axis=0)
+    std = np.sqrt(mean.var(axis=0) + within)
+    if not (np.isfinite(std) & (std > 0)).all():
+        raise ValueError(
+            "the archive's latents have a dimension that is constant or not finite; "
+            "check the policy autoencoder's fit"
+        )
+    return LatentStatistics(
+        mean=jnp.asarray(mean.mean(axis=0), jnp.float32), std=jnp.asarray(std, jnp.float32)
+    )
+
+
+class NoiseSchedule(PyTreeNode):
+    """Linear β with α = 1 - β and ᾱ its running product; each [N]."""
+
+    beta: Array
+    alpha: Array
+    alpha_bar: Array
+
+
+def noise_schedule(noise_steps: int) -> NoiseSchedule:
+    """The linear schedule 1e-4 .. 0.02 of N = 1000 (Ho et al., 2020), rescaled for another N.
+
+    β is multiplied by the one factor that leaves ᾱ_N at its value for N = 1000, about 4e-5:
+    otherwise the last step would not be pure noise and sampling from N(0, I) would be wrong.
+    """
+    target = np.log1p(-np.linspace(*PAPER_BETA, PAPER_STEPS)).sum()
+    base = np.linspace(*PAPER_BETA, noise_steps)
+    low, high = 0.0, 1.0 / base[-1]
+    for _ in range(200):
+        factor = 0.5 * (low + high)
+        if np.log1p(-factor * base).sum() > target:
+            low = factor
+        else:
+            high = factor
+    beta = base if noise_steps == PAPER_STEPS else low * base
+    alpha_bar = np.exp(np.log1p(-beta).cumsum())
+    return NoiseSchedule(
+        beta=jnp.asarray(beta, jnp.float32),
+        alpha=jnp.asarray(1 - beta, jnp.float32),
+        alpha_bar=jnp.asarray(alpha_bar, jnp.float32),
+    )
+
+
+class NoisePredictor(nn.Module):
+    """ε_θ(z_i, i, τ_θ(L_T)) of Eq. 5, on flat latents.
+
+    ε_θ = √ᾱ_i UNet + √(1 - ᾱ_i) z_i, the velocity form of Salimans & Ho (2022). If the UNet were to
+    give ε itself, its error would enter the clean latent divided by √ᾱ_i, by 158 times at i = N,
+    and a short fit would not sample anything usable.
+    """
+
+    config: DiffusionConfig
+
+    def setup(self):
+        self.conditioner = Conditioner(self.config.bins, self.config.token_features)
+        self.unet = UNet(self.config.unet)
+
+    def __call__(self, noisy: Array, step: Array, v_hat: Array, dropped: Array) -> Array:
+        """Noise [D] predicted in `noisy` [D] at noise step `step` [] of N, for `v_hat` [U].
+
+        `dropped` [] bool: replace the condition by the unconditional tokens.
+        """
+        return self.predict(noisy, step, self.tokens(v_hat, dropped))
+
+    def tokens(self, v_hat: Array, dropped: Array) -> Array:
+        return self.conditioner(v_hat, dropped)
+
+    def predict(self, noisy: Array, step: Array, tokens: Array) -> Array:
+        # The step's embedding is made for N = 1000.
+        scaled = step * (PAPER_STEPS / self.config.noise_steps)
+        output = self.unet(noisy.reshape(self.config.grid), scaled, tokens).reshape(-1)
+        alpha_bar = noise_schedule(self.config.noise_steps).alpha_bar[step - 1]
+        return jnp.sqrt(alpha_bar) * output + jnp.sqrt(1 - alpha_bar) * noisy
+
+
+def init_network(key: Array, config: DiffusionConfig, num_events: int) -> Any:
+    """Initial parameters of the noise predictor for a task language of U = `num_events`."""
+    return NoisePredictor(config).init(
+        key,
+        jnp.zeros(config.latent_size),
+        jnp.ones((), jnp.int32),
+        jnp.zeros(num_events),
+        jnp.array(False),
+    )
+
+
+def add_noise(schedule: NoiseSchedule, z: Array, step: Array, noise: Array) -> Array:
+    """Eq. 2: √ᾱ_i z + √(1 - ᾱ_i) ε. (Eq. 5 prints α_i where ᾱ_i is meant.)
+
+    Args:
+        z, noise: [D].
+        step: int [], from 1 to N.
+    """
+    alpha_bar = schedule.alpha_bar[step - 1]
+    return jnp.sqrt(alpha_bar) * z + jnp.sqrt(1 - alpha_bar) * noise
+
+
+def make_sample_fn(config: DiffusionConfig, statistics: LatentStatistics) -> SampleFn:
+    """sample_fn(key, archive) -> (z [B, D] standardised, v_hat [B, U] jittered) for `fit`.
+
+    Policies are drawn uniformly with replacement, z from each one's posterior.
+    """
+
+    def sample_fn(key: Array, archive: LatentArchive) -> tuple[Array, Array]:
+        row_key, posterior_key, jitter_key = jax.random.split(key, 3)
+        rows = jax.random.randint(row_key, (config.batch_size,), 0, archive.z_mean.shape[0])
+        noise = jax.random.normal(posterior_key, (config.batch_size, config.latent_size))
+        z = archive.z_mean[rows] + jnp.exp(0.5 * archive.z_log_variance[rows]) * noise
+        v_hat = jittered(jitter_key, archive.v_hat[rows], config.frequency_jitter)
+        return statistics.standardise(z), v_hat
+
+    return sample_fn
+
+
+def make_diffusion_loss(config: DiffusionConfig) -> LossFn:
+    """Eq. 5 as a loss_fn for `fit`: squared error of the noise, mean over B and over D.
+
+    The noise step is uniform over 1 .. N. The paper sums over D and all steps; the mean differs by
+    a constant factor alone.
+    """
+    network, schedule = NoisePredictor(config), noise_schedule(config.noise_steps)
+
+    def loss_fn(params: Any, key: Array, batch: tuple[Array, Array]):
+        z, v_hat = batch  # [B, D], [B, U]
+        step_key, noise_key, drop_key = jax.random.split(key, 3)
+        # One uniform draw in each of B equal parts of 1 .. N: still uniform, with less variance.
+        fraction = (jnp.arange(z.shape[0]) + jax.random.uniform(step_key, z.shape[:1])) / z.shape[0]
+        step = 1 + jnp.minimum(fraction * config.noise_steps, config.noise_steps - 1).astype(int)
+        noise = jax.random.normal(noise_key, z.shape)
+        dropped = jax.random.bernoulli(drop_key, config.condition_dropout, z.shape[:1])
+        noisy = jax.vmap(add_noise, (None, 0, 0, 0))(schedule, z, step, noise)
+        predicted = jax.vmap(network.apply, (None, 0, 0, 0, 0))(params, noisy, step, v_hat, dropped)
+        error = jnp.mean(jnp.square(jnp.asarray(predicted) - noise), axis=-1)  # [B]
+        weight = jnp.minimum(1 / schedule.alpha_bar[step - 1], config.largest_weight)
+        return jnp.mean(weight * error), {"noise_error": jnp.mean(error)}
+
+    return loss_fn
+
+
+def ddpm_step(
+    schedule: NoiseSchedule, noisy: Array, step: Array, predicted: Array, noise: Array
+) -> Array:
+    """Eq. 1: from z_i to z_{i-1}; the last step, i = 1, adds no noise.
+
+    Args:
+        noisy, predicted, noise: [D]; z_i, the predicted ε, and the fresh noise.
+        step: int [], i from 1 to N.
+    """
+    beta, alpha, alpha_bar = jax.tree.map(
+        lambda values: values[step - 1], (schedule.beta, schedule.alpha, schedule.alpha_bar)
+    )
+    mean = (noisy - (1 - alpha) / jnp.sqrt(1 - alpha_bar) * predicted) / jnp.sqrt(alpha)
+    return mean + jnp.where(step > 1, jnp.sqrt(beta), 0.0) * noise
+
+
+def ddim_step(
+    noisy: Array,
+    alpha_bar: Array,
+    next_alpha_bar: Array,
+    predicted: Array,
+    noise: Array,
+    eta: float = 0.0,
+    clip: float = float("inf"),
+) -> Array:
+    """One step of DDIM (Song et al., 2021, Eq. 12 and 16) between two noise levels.
+
+    Args:
+        noisy, predicted, noise: [D]; the latent, the predicted ε, and fresh noise (unused at η=0).
+        alpha_bar, next_alpha_bar: [], levels before and after; 1 is noiseless.
+        eta: 0 deterministic, 1 the variance of DDPM.
+        clip: bound on the magnitude of the predicted clean latent; ε follows the clipped one.
+    """
+    clean = (noisy - jnp.sqrt(1 - alpha_bar) * predicted) / jnp.sqrt(alpha_bar)
+    if clip < float("inf"):
+        clean = jnp.clip(clean, -clip, clip)
+        predicted = (noisy - jnp.sqrt(alpha_bar) * clean) / jnp.sqrt(1 - alpha_bar)
+    sigma = eta * jnp.sqrt(
+        (1 - next_alpha_bar) / (1 - alpha_bar) * (1 - alpha_bar / next_alpha_bar)
+    )
+    direction = jnp.sqrt(1 - next_alpha_bar - sigma**2) * predicted
+    return jnp.sqrt(next_alpha_bar) * clean + direction + sigma * noise
+
+
+def sample_ddpm(key: Array, noise_fn: NoiseFn, config: DiffusionConfig) -> Array:
+    """Standardised latent [D] by Eq. 1 from N(0, I), all N steps. Consumes `key`."""
+    schedule = noise_schedule(config.noise_steps)
+    start_key, noise_key = jax.random.split(key)
+
+    def body(noisy: Array, step: Array):
+        noise = jax.random.normal(jax.random.fold_in(noise_key, step), noisy.shape)
+        return ddpm_step(schedule, noisy, step, noise_fn(noisy, step), noise), None
+
+    start = jax.random.normal(start_key, (config.latent_size,))
+    return jax.lax.scan(body, start, jnp.arange(config.noise_steps, 0, -1))[0]
+
+
+def ddim_noise_steps(config: DiffusionConfig) -> np.ndarray:
+    """The noise steps that DDIM visits, int [S], evenly spaced from N down to 1."""
+    return np.round(np.linspace(config.noise_steps, 1, config.ddim_steps)).astype(np.int32)
+
+
+def sample_ddim(key: Array, noise_fn: NoiseFn, config: DiffusionConfig) -> Array:
+    """Standardised latent [D] by DDIM from N(0, I), `ddim_steps` steps. Consumes `key`."""
+    alpha_bar = noise_schedule(config.noise_steps).alpha_bar
+    start_key, noise_key = jax.random.split(key)
+    steps = jnp.asarray(ddim_noise_steps(config))
+    levels = jnp.append(alpha_bar[steps - 1], 1.0)
+
+    def body(noisy: Array, visit):
+        step, level, next_level = visit
+        noise = jnp.zeros_like(noisy)
+        if config.eta > 0:
+            noise = jax.random.normal(jax.random.fold_in(noise_key, step), noisy.shape)
+        predicted = noise_fn(noisy, step)
+        return ddim_step(noisy, level, next_level, predicted, noise, config.eta, config.clip), None
+
+    start = jax.random.normal(start_key, (config.latent_size,))
+    return jax.lax.scan(body, start, (steps, levels[:-1], levels[1:]))[0]
+
+
+SAMPLERS = {"ddim": sample_ddim, "ddpm": sample_ddpm}
+
+
+def sample(
+    key: Array,
+    params: DiffusionParams,
+    v_hat: Array,
+    config: DiffusionConfig,
+    sampler: str = "ddim",
+) -> Array:
+    """Generate a policy's latent from a task-language description.
+
+    Args:
+        key: consumed.
+        params: a fitted diffusion; its network should be the fit's averaged parameters.
+        v_hat: [U], normalised frequencies in [0, 1].
+        config: the configuration that `params` was fitted with.
+        sampler: "ddim" (fast) or "ddpm" (Eq. 1, N network calls).
+
+    Returns:
+        z [D], on the autoencoder's scale.
+
+    Raises:
+        ValueError: unknown `sampler`.
+    """
+    if sampler not in SAMPLERS:
+        raise ValueError(f"sampler is {sampler!r}; expected one of {sorted(SAMPLERS)}")
+    apply = partial(NoisePredictor(config).apply, params.network)
+    # Tokens of the condition and, for guidance alone, those of no condition.
+    branches = (False,) if config.guidance == 1 else (False, True)
+    tokens = jax.vmap(lambda dropped: apply(v_hat, dropped, method="tokens"))(jnp.array(branches))
+
+    def noise_fn(noisy: Array, step: Array) -> Array:
+        predicted = jax.vmap(lambda given: apply(noisy, step, given, method="predict"))(tokens)
+        return predicted[-1] + config.guidance * (predicted[0] - predicted[-1])
+
+    return params.statistics.restore(SAMPLERS[sampler](key, noise_fn, config))
