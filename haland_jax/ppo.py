@@ -168,7 +168,7 @@ def ppo_loss(
     config: PPOConfig,
     entropy_weight: jax.Array,
 ) -> jax.Array:
-    """Clipped surrogate, clipped value loss and entropy bonus, mean over the batch.
+    """Clipped surrogate, value loss and entropy bonus, mean over the batch.
 
     Schulman et al. (2017), Eq. 7 and 9; advantages are normalised over the minibatch.
     """
@@ -180,9 +180,7 @@ def ppo_loss(
     ratio = jnp.exp(networks.log_prob(distribution, batch.action) - batch.log_prob)
     clipped_ratio = jnp.clip(ratio, 1 - config.clip, 1 + config.clip)
     policy_loss = -jnp.mean(jnp.minimum(ratio * advantage, clipped_ratio * advantage))
-    clipped_value = batch.value + jnp.clip(value - batch.value, -config.clip, config.clip)
-    error = jnp.maximum((value - batch.target) ** 2, (clipped_value - batch.target) ** 2)
-    value_loss = 0.5 * jnp.mean(error)
+    value_loss = 0.5 * jnp.mean((value - batch.target) ** 2)
     entropy = jnp.mean(networks.entropy(distribution))
     return policy_loss + config.value_weight * value_loss - entropy_weight * entropy
 
@@ -265,7 +263,7 @@ def _update(
 ) -> tuple[TrainState, dict[str, jax.Array]]:
     """One rollout and the learning from it."""
     progress = state.update / config.num_updates
-    rollout_key, learn_key = jax.random.split(jax.random.fold_in(state.key, state.update))
+    rollout_key = jax.random.fold_in(state.key, state.update)
     confined = env.confine(style)
     bound = progress < config.confined_until
     style_now = jax.tree.map(lambda held, free: jnp.where(bound, held, free), confined, style)
@@ -278,7 +276,6 @@ def _update(
         "learning_rate": _falling(config.learning_rate, config.final_learning_rate, progress),
         "entropy_weight": _falling(config.entropy, config.final_entropy, progress),
     }
-    keys = jax.random.split(learn_key)
     losses = []
     for agent, role in enumerate(("ego", "partner")):
         learner = getattr(state, role)
@@ -286,9 +283,9 @@ def _update(
             continue
         actor = actors[agent]
         batch = _make_batch(
-            config, actor, critic, learner, steps, state.observations[agent], agent, scaled[agent]
+            config, critic, learner, steps, state.observations[agent], agent, scaled[agent]
         )
-        learner, loss = _learn(config, actor, critic, learner, batch, keys[agent], **rates)
+        learner, loss = _learn(config, actor, critic, learner, batch, **rates)
         state = state.replace(**{role: learner})
         losses.append(loss)
     metrics = {
@@ -363,7 +360,6 @@ def _frozen_partners(actor: MLPActor, policies: Policy, observation: jax.Array) 
 
 def _make_batch(
     config: PPOConfig,
-    actor: MLPActor,
     critic: MLPCritic,
     learner: Learner,
     steps: dict[str, Any],
@@ -372,7 +368,6 @@ def _make_batch(
     rewards: jax.Array,
 ) -> Batch:
     """Values and advantages of one player's experience."""
-    del actor
     observation = steps["observations"][agent]
     everything = jnp.concatenate([observation, last_observation[None]])
     values = critic.apply(learner.critic, everything)
@@ -395,21 +390,26 @@ def _learn(
     critic: MLPCritic,
     learner: Learner,
     batch: Batch,
-    key: jax.Array,
     *,
     learning_rate: jax.Array,
     entropy_weight: jax.Array,
 ) -> tuple[Learner, jax.Array]:
-    """Some passes over the batch, in minibatches of whole games."""
-    optimizer = make_optimizer(config)
-    size = config.num_envs // config.num_minibatches
-    # Whole games in a minibatch: gathering them copies long rows, and no sort is needed.
-    by_game = jax.tree.map(lambda leaf: jnp.swapaxes(leaf, 0, 1), batch)
+    """Some passes over the batch, in minibatches of whole games.
 
-    def one_step(carry, games):
+    Games are exchangeable, so each minibatch is a fixed share of them: a shuffle that differs
+    between the members of a population would cost as much as the learning itself on a CPU.
+    """
+    optimizer = make_optimizer(config)
+
+    def split(leaf: jax.Array) -> jax.Array:
+        by_game = jnp.swapaxes(leaf, 0, 1)
+        return by_game.reshape(config.num_minibatches, -1, *leaf.shape[2:])
+
+    minibatches = jax.tree.map(split, batch)
+
+    def one_step(carry, index):
         params, optimizer_state = carry
-        minibatch = jax.tree.map(lambda leaf: leaf[games], by_game)
-        minibatch = jax.tree.map(lambda leaf: leaf.reshape(-1, *leaf.shape[2:]), minibatch)
+        minibatch = jax.tree.map(lambda leaf: leaf[index], minibatches)
         loss, gradient = jax.value_and_grad(ppo_loss)(
             params, minibatch, actor, critic, config, entropy_weight
         )
@@ -417,11 +417,7 @@ def _learn(
         params = jax.tree.map(lambda p, u: p - learning_rate * u, params, updates)
         return (params, optimizer_state), loss
 
-    orders = jax.vmap(lambda k: jax.random.permutation(k, config.num_envs))(
-        jax.random.split(key, config.epochs)
-    )
     carry = ((learner.actor, learner.critic), learner.optimizer_state)
-    (params, optimizer_state), losses = jax.lax.scan(
-        one_step, carry, orders.reshape(config.epochs * config.num_minibatches, size)
-    )
+    order = jnp.tile(jnp.arange(config.num_minibatches), config.epochs)
+    (params, optimizer_state), losses = jax.lax.scan(one_step, carry, order)
     return Learner(*params, optimizer_state), jnp.mean(losses)

@@ -34,7 +34,7 @@ class Overcooked:
     dynamics: Literal["new", "old"] = "new"
     encoding: Literal["features", "grid"] = "features"
     shaping: Literal["guided", "reference"] = "guided"
-    random_start: float = 0.5
+    random_start: float = 0.9
     weights: ShapingWeights = ShapingWeights()
 
     def __post_init__(self):

@@ -23,17 +23,21 @@ NUM_CONTENTS = 16
 class ShapingWeights:
     """Weights of the guided shaping, in units of the team reward (a soup pays 20).
 
-    `potting`, `dish` and `soup_taken` are the reference's. Starting an unfinished pot takes
-    back what its ingredients paid.
+    `potting` (of the second ingredient; the first earns half, the third one and a half times
+    as much), `dish` and `soup_taken` are the reference's. Starting an unfinished pot costs
+    little: taking back all that its ingredients paid kept random players from ever learning
+    to use the pot, which they start by accident all the time.
     """
 
     potting: float = 3.0
+    potting_growth: float = 0.0
     dish: float = 3.0
     soup_taken: float = 5.0
+    unordered_soup_taken: float = 2.0
     start_full: float = 1.0
-    start_unfinished: float = -3.0
-    spoilt: float = -3.0
-    unpaid_delivery: float = -5.0
+    start_unfinished: float = 0.0
+    spoilt: float = -1.0
+    unpaid_delivery: float = -1.0
     hand_over: float = 1.0
 
 
@@ -127,10 +131,9 @@ def guided_shaping_terms(
         layout: the kitchen.
         transition: the step.
         pays: pay by station and content, float32 [K, content].
-        hand_over: potential of an item kind (onion, tomato, dish, soup) lying on each
-            counter, float32 [C, 4]: positive where the other player needs it, negative where
-            it is in the way. A player is paid the potential's change that it causes, so
-            putting a thing down and taking it back earns nothing.
+        hand_over: what each player earns by putting an item kind (onion, tomato, dish, soup)
+            on a counter, float32 [agent, C, 4]. Taking it earns the opposite, so that nothing
+            is won by putting a thing down and taking it back, whoever does it.
         weights: the terms' weights.
     """
     did = transition.interactions
@@ -149,16 +152,17 @@ def guided_shaping_terms(
 
     counter = jnp.minimum(did.station, layout.num_counters - 1)
     kind = jnp.clip(did.item, 1, dynamics.SOUP) - 1
-    value = hand_over[counter, kind]
+    value = hand_over[np.arange(2), counter, kind]
     put = did.change == dynamics.PUT_ON_COUNTER
     picked = did.change == dynamics.TAKEN_FROM_COUNTER
     return {
-        "potting": weights.potting * (potted & viable),
+        "potting": weights.potting * (potted & viable) * (1 + weights.potting_growth * (amount - 1) / 2),
         "spoilt": weights.spoilt * (potted & ~viable),
         "dish": weights.dish * useful_dishes(layout, transition),
         "start_full": weights.start_full * (started & complete),
-        "start_unfinished": weights.start_unfinished * jnp.where(started & ~complete, amount, 0),
+        "start_unfinished": weights.start_unfinished * (started & ~complete),
         "soup_taken": weights.soup_taken * (taken & complete),
+        "unordered_soup_taken": weights.unordered_soup_taken * (taken & ~complete),
         "unpaid_delivery": weights.unpaid_delivery * unpaid,
         "hand_over": weights.hand_over * value * (put.astype(jnp.float32) - picked),
     }

@@ -12,7 +12,7 @@ import jax.numpy as jnp
 import numpy as np
 from flax.struct import PyTreeNode
 
-from envs.overcooked import dynamics, reward
+from envs.overcooked import dynamics, events, reward
 from envs.overcooked.dynamics import State
 from envs.overcooked.layouts import Layout
 
@@ -34,7 +34,8 @@ class Style(PyTreeNode):
         pays: what a soup pays by serving cell and content, float32 [K, content].
         task: what the partner is told about the order, float32 [task]; empty in kitchens
             where every style serves the same order.
-        hand_over: worth of an item kind lying on a counter, float32 [C, 4]; training only.
+        hand_over: what each player earns by putting an item kind on a counter, float32
+            [agent, C, 4]; training only.
         pool: moments of games to start from in training, `State` with leading axis [pool].
     """
 
@@ -58,7 +59,7 @@ class Rule:
         use: whether the partner may use a station of a kind letter at (x, y).
         role: whether the ego's role includes the floor cell (x, y).
         role_use: whether the ego's role includes a station.
-        needs: item kinds that one player must hand to the other over a counter.
+        gives: item kinds that each player must hand to the other over a counter.
         start: (x, y) of both players, where the layout's own does not fit.
         order: content and number of the serving cell from the left, if only that pays.
     """
@@ -67,7 +68,7 @@ class Rule:
     use: Callable[[str, int, int], bool] = lambda kind, x, y: True
     role: Callable[[int, int], bool] = lambda x, y: True
     role_use: Callable[[str, int, int], bool] = lambda kind, x, y: True
-    needs: tuple[str, ...] = ()
+    gives: tuple[tuple[str, ...], tuple[str, ...]] = ((), ())
     start: tuple[tuple[int, int] | None, tuple[int, int] | None] = (None, None)
     order: tuple[int, int] | None = None
 
@@ -130,14 +131,14 @@ def _crossway() -> dict[str, Rule]:
 
 def _diverse_coordination() -> dict[str, Rule]:
     lacks = {
-        "no_onion": ("O", ("onion",)),
-        "no_dish": ("D", ("dish",)),
-        "no_onion_no_dish": ("OD", ("onion", "dish")),
-        "no_delivery": ("S", ("soup",)),
+        "no_onion": ("O", (("onion",), ())),
+        "no_dish": ("D", (("dish",), ())),
+        "no_onion_no_dish": ("OD", (("onion", "dish"), ())),
+        "no_delivery": ("S", ((), ("soup",))),
     }
     rules = {}
     for what in ("no_onion", "no_dish", "no_onion_no_dish", "no_delivery"):
-        letters, needs = lacks[what]
+        letters, gives = lacks[what]
         for side, near, counters in (
             ("left", lambda x: x <= 4, (1, 2, 3)),
             ("right", lambda x: x >= 4, (5, 6, 7)),
@@ -153,7 +154,7 @@ def _diverse_coordination() -> dict[str, Rule]:
                 ),
                 role=lambda x, y, near=near: y > 1 or near(x),
                 role_use=on_side,
-                needs=needs,
+                gives=gives,
             )
     order = ("no_onion", "no_dish", "no_onion_no_dish", "no_delivery")
     return {
@@ -163,7 +164,7 @@ def _diverse_coordination() -> dict[str, Rule]:
 
 def _diverse_orders() -> dict[str, Rule]:
     return {
-        f"{ingredient}_{number}": Rule(needs=("dish", "soup"), order=(content, number))
+        f"{ingredient}_{number}": Rule(gives=((), ("dish", "soup")), order=(content, number))
         for ingredient, content in (("onion", 12), ("tomato", 3))
         for number in (1, 2, 3, 4)
     }
@@ -269,14 +270,19 @@ def _hand_over_worth(
     partner_cells: np.ndarray,
     partner_targets: np.ndarray,
 ) -> np.ndarray:
-    """+1 for a needed item on a counter that both players use, -1 for any other there."""
-    worth = np.zeros((layout.num_counters, 4), np.float32)
-    if rule.needs:
+    """What putting earns on counters that both players use.
+
+    The giver of a needed kind earns 1 by putting it there, and its taker 1 by taking it;
+    anything else is in the way and costs 1.
+    """
+    worth = np.zeros((2, layout.num_counters, 4), np.float32)
+    if any(rule.gives):
         ego_side = layout.stations_beside(_room(layout, int(start[0])))
         partner_side = layout.stations_beside(partner_cells & _room(layout, int(start[1])))
         shared = (ego_side & partner_side & partner_targets)[: layout.num_counters]
-        kinds = ("onion", "tomato", "dish", "soup")
-        worth[shared] = [1.0 if kind in rule.needs else -1.0 for kind in kinds]
+        for agent in (0, 1):
+            values = [1.0 if kind in rule.gives[agent] else -1.0 for kind in events.ITEM_KINDS]
+            worth[agent, shared] = values
     return worth
 
 
@@ -334,5 +340,5 @@ def _random_moment(
         counters=draw_items(layout.num_counters, 0.15),
         pot_content=(amounts * units).astype(np.int32),
         pot_timer=np.where(cooking, timer, dynamics.IDLE).astype(np.int32),
-        time=np.array(random.integers(0, max_steps - 50), np.int32),
+        time=np.array(random.integers(max(0, max_steps - 200), max_steps - 40), np.int32),
     )

@@ -1,0 +1,200 @@
+"""The presets: everything that a run depends on, as frozen dataclasses."""
+
+import dataclasses
+from collections.abc import Callable
+
+from haland_jax.diffusion import DiffusionConfig
+from haland_jax.fit import FitConfig
+from haland_jax.partners import PartnersConfig
+from haland_jax.policy_vae import PolicyVAEConfig
+from haland_jax.ppo import PPOConfig
+from haland_jax.translator import TranslatorConfig
+
+DEFAULT_ENVIRONMENT = "overcooked/diverse_coordination"
+
+
+@dataclasses.dataclass(frozen=True)
+class CompressionConfig:
+    """The policy VAE's fit.
+
+    Attributes:
+        vae: sizes and loss (Table 2).
+        fit: optimiser and length.
+        chunk_steps: steps between two refreshes of the states; divides `fit.steps`.
+        own_states: states of each policy from its games with its own training partners.
+        other_states: states from games with partners of other styles.
+        decoded_states: states from games of the *decoded* policy, labelled by the original;
+            they stop small errors from adding up along a game (DAgger, Ross et al., 2011).
+        gate_games: games of each policy and partner in the gate.
+    """
+
+    vae: PolicyVAEConfig = dataclasses.field(default_factory=PolicyVAEConfig)
+    fit: FitConfig = dataclasses.field(
+        default_factory=lambda: FitConfig(learning_rate=1e-2, steps=2000, warmup_steps=50)
+    )
+    chunk_steps: int = 250
+    own_states: int = 2048
+    other_states: int = 512
+    decoded_states: int = 1024
+    gate_games: int = 64
+
+    def __post_init__(self):
+        if self.fit.steps % self.chunk_steps:
+            raise ValueError(
+                f"chunk_steps is {self.chunk_steps}; expected a divisor of fit.steps = "
+                f"{self.fit.steps}"
+            )
+
+
+@dataclasses.dataclass(frozen=True)
+class EvaluationConfig:
+    """How generated policies are judged, with held-out partners only.
+
+    Attributes:
+        games: games of each pair of policies.
+        samples: policies generated from each sentence, or each style's true task language.
+        batch: pairs that play at once; the compiled program has this size.
+    """
+
+    games: int = 16
+    samples: int = 2
+    batch: int = 64
+
+
+@dataclasses.dataclass(frozen=True)
+class RunConfig:
+    """Everything that the results of a run depend on.
+
+    Attributes:
+        environment: name in the registry.
+        preset: name of the preset that this was made from.
+        seed: of all randomness.
+        max_steps: steps of a game.
+        encoder: folder or hub name of a BERT checkpoint; empty for the packaged MiniLM.
+        partners: partners and best responses (stage 1).
+        task_language_games: games of each pair from which Eq. 8's frequencies are counted.
+        compression: policy VAE (stage 3).
+        diffusion: latent diffusion (stage 4).
+        translator: sentence translator (stage 5).
+        evaluation: what is measured (stage 6).
+    """
+
+    environment: str
+    preset: str
+    seed: int = 0
+    max_steps: int = 400
+    encoder: str = ""
+    partners: PartnersConfig = dataclasses.field(default_factory=PartnersConfig)
+    task_language_games: int = 32
+    compression: CompressionConfig = dataclasses.field(default_factory=CompressionConfig)
+    diffusion: DiffusionConfig = dataclasses.field(default_factory=DiffusionConfig)
+    translator: TranslatorConfig = dataclasses.field(default_factory=TranslatorConfig)
+    evaluation: EvaluationConfig = dataclasses.field(default_factory=EvaluationConfig)
+
+
+def _refit(total_steps: int) -> PPOConfig:
+    return PPOConfig(
+        total_steps=total_steps,
+        learning_rate=3e-4,
+        entropy=0.01,
+        final_entropy=0.002,
+        shaping=0.0,
+        confined_until=0.0,
+    )
+
+
+def smoke(environment: str, seed: int) -> RunConfig:
+    """Every stage at toy size, to see that all of it works; nothing is learnt.
+
+    `python -m experiments.run --preset smoke`; about two minutes on two CPU cores.
+    """
+    tiny = PPOConfig(
+        total_steps=1280, num_envs=8, rollout_steps=20, num_minibatches=2, epochs=1
+    )
+    refit = dataclasses.replace(tiny, total_steps=640, shaping=0.0, confined_until=0.0)
+    return RunConfig(
+        environment=environment,
+        preset="smoke",
+        seed=seed,
+        max_steps=60,
+        partners=PartnersConfig(
+            train_seeds=2,
+            held_out_seeds=1,
+            spare_seeds=0,
+            joint=tiny,
+            refit=refit,
+            oracle=refit,
+            oracle_candidates=2,
+            evaluation_games=4,
+        ),
+        task_language_games=4,
+        compression=CompressionConfig(
+            fit=FitConfig(learning_rate=1e-2, steps=40, warmup_steps=5),
+            chunk_steps=20,
+            own_states=64,
+            other_states=32,
+            decoded_states=32,
+            gate_games=4,
+        ),
+        diffusion=DiffusionConfig(
+            fit=FitConfig(learning_rate=3e-3, steps=40, warmup_steps=5, ema_decay=0.9),
+            batch_size=16,
+            ddim_steps=5,
+            clip=8.0,
+        ),
+        translator=TranslatorConfig(
+            fine_tuning=FitConfig(learning_rate=2e-4, steps=4, warmup_steps=1),
+            translation=FitConfig(learning_rate=1e-4, steps=20, warmup_steps=5),
+        ),
+        evaluation=EvaluationConfig(games=4, samples=1, batch=32),
+    )
+
+
+def quick(environment: str, seed: int) -> RunConfig:
+    """The whole method with two training and two held-out seeds a style.
+
+    `python -m experiments.run`; about a quarter of an hour on two CPU cores.
+    """
+    return RunConfig(
+        environment=environment,
+        preset="quick",
+        seed=seed,
+        partners=PartnersConfig(
+            train_seeds=2,
+            held_out_seeds=2,
+            spare_seeds=0,
+            joint=PPOConfig(total_steps=600_000),
+            refit=_refit(200_000),
+            oracle=_refit(200_000),
+            oracle_candidates=2,
+        ),
+        diffusion=DiffusionConfig(clip=8.0),
+    )
+
+
+def paper(environment: str, seed: int) -> RunConfig:
+    """The scale of App. C to E: five training and five held-out seeds a style.
+
+    `python -m experiments.run --preset paper`; several hours on two CPU cores.
+    """
+    return RunConfig(
+        environment=environment,
+        preset="paper",
+        seed=seed,
+        partners=PartnersConfig(joint=PPOConfig(total_steps=2_000_000), oracle_candidates=3),
+        compression=CompressionConfig(
+            fit=FitConfig(learning_rate=5e-3, steps=10_000, warmup_steps=200)
+        ),
+        diffusion=DiffusionConfig(
+            clip=8.0,
+            fit=FitConfig(learning_rate=2e-3, steps=10_000, warmup_steps=200, ema_decay=0.999),
+        ),
+        evaluation=EvaluationConfig(games=32, samples=4),
+    )
+
+
+PRESETS: dict[str, Callable[[str, int], RunConfig]] = {
+    "smoke": smoke,
+    "quick": quick,
+    "paper": paper,
+}

@@ -1,0 +1,297 @@
+"""What is measured: every method's return with partners that no method has met.
+
+Returns are means over games and over the policies that a method offers for a style; they are
+given by style and held-out seed, so that any statistic can be computed later.
+"""
+
+import time
+from collections.abc import Mapping, Sequence
+from typing import Any
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+
+from experiments.progress import StageProgress
+from experiments.stages import (
+    Run,
+    load_archive,
+    load_haland,
+    load_population,
+    load_task_language,
+    load_vae,
+)
+from haland_jax import partners, policy_vae
+from haland_jax.deployment import Haland
+from haland_jax.networks import Policy
+
+ORACLE, BEST_RESPONSE, RECONSTRUCTION = "Oracle", "Best response", "VAE reconstruction"
+TRUE_LANGUAGE = "Diffusion, true task language"
+TRAINING_SENTENCES = "Haland, training sentences"
+TEST_SENTENCES, WRONG_SENTENCE = "Haland, test sentences", "Haland, wrong sentence"
+GATE_PERTURBATION = 0.1
+
+
+class Judge:
+    """Plays policies with partners, many pairs at a time in one compiled program."""
+
+    def __init__(self, env: Any, games: int, batch: int):
+        self.env, self.batch = env, batch
+        self._play = partners.compile_evaluation(env, games)
+
+    def returns(self, key: jax.Array, egos: Policy, partner: Policy, styles: Any) -> np.ndarray:
+        """Mean return of each pair; all arguments but the key have the leading axis [pair]."""
+        total = jax.tree.leaves(styles)[0].shape[0]
+        keys = jax.random.split(key, total)
+        means = []
+        for first in range(0, total, self.batch):
+            rows = np.minimum(np.arange(first, first + self.batch), total - 1)
+            played = self._play(
+                keys[rows], *jax.tree.map(lambda leaf: leaf[rows], (egos, partner, styles))
+            )
+            means.append(np.asarray(played.returns.mean(axis=1)))
+        return np.concatenate(means)[:total]
+
+    def with_held_out(self, key: jax.Array, egos: Policy, held_out: Policy) -> np.ndarray:
+        """Mean return of each style's egos with each held-out partner of that style.
+
+        Args:
+            key: consumed.
+            egos: leading axes [style, ego].
+            held_out: leading axes [style, seed].
+
+        Returns:
+            [style, seed, ego].
+        """
+        styles, count = jax.tree.leaves(egos)[0].shape[:2]
+        seeds = jax.tree.leaves(held_out)[0].shape[1]
+        flat_egos = jax.tree.map(
+            lambda leaf: jnp.repeat(leaf[:, None], seeds, axis=1).reshape(-1, *leaf.shape[2:]), egos
+        )
+        flat_partners = jax.tree.map(
+            lambda leaf: jnp.repeat(leaf, count, axis=1).reshape(-1, *leaf.shape[2:]), held_out
+        )
+        flat_styles = partners.repeat_styles(self.env, seeds * count)
+        returns = self.returns(key, flat_egos, flat_partners, flat_styles)
+        return returns.reshape(styles, seeds, count)
+
+
+def policy_vae_gate(run: Run, judge: Judge, key: jax.Array) -> dict[str, Any]:
+    """Whether decoded policies earn what their originals earn, with training partners.
+
+    Returns:
+        Shares of the original's return, decoded / original: the mean and the lowest over the
+        archive, as decoded and with z perturbed by 0.1 of the latents' standard deviation.
+    """
+    population, archive = load_population(run), load_archive(run)
+    vae, params, posterior = load_vae(run)
+    times, env = run.config.partners.train_seeds, run.env
+    play_key, noise_key = jax.random.split(key)
+    originals = partners.flatten(archive.egos.actor)
+    perturbed = policy_vae.perturb(noise_key, posterior.mean, GATE_PERTURBATION)
+    versions = {
+        "original": originals,
+        "decoded": policy_vae.decode(vae, params, posterior.mean),
+        "perturbed": policy_vae.decode(vae, params, perturbed),
+    }
+    repeats = max(1, run.config.compression.gate_games // run.config.evaluation.games)
+    everyone = jax.tree.map(lambda leaf: jnp.tile(leaf, (1, repeats) + (1,) * (leaf.ndim - 2)),
+                            population.train_partners)
+    earned = {}
+    for name, policies in versions.items():
+        by_style = partners.unflatten(policies, len(env.style_names))
+        returns = judge.with_held_out(play_key, by_style, everyone)
+        earned[name] = returns.mean(axis=1)
+    shares = {
+        name: earned[name] / np.maximum(earned["original"], 1e-9) for name in ("decoded", "perturbed")
+    }
+    return {
+        "partners": times,
+        "games": repeats * run.config.evaluation.games,
+        "original_returns": earned["original"],
+        **{f"{name}_share": share for name, share in shares.items()},
+    }
+
+
+def evaluate(run: Run, task: StageProgress) -> dict[str, Any]:
+    """Measures every method; returns what `results.json` is made of."""
+    config, env = run.config.evaluation, run.env
+    population, archive = load_population(run), load_archive(run)
+    haland = load_haland(run)
+    language = load_task_language(run)
+    judge = Judge(env, config.games, config.batch)
+    key = jax.random.fold_in(jax.random.key(run.config.seed), 1000)
+    keys = iter(jax.random.split(key, 16))
+    styles, held_out = len(env.style_names), population.held_out_partners
+    egos: dict[str, Policy] = {
+        ORACLE: archive.oracles,
+        BEST_RESPONSE: archive.egos.actor,
+    }
+    vae, vae_params, posterior = load_vae(run)
+    decoded = policy_vae.decode(vae, vae_params, posterior.mean)
+    egos[RECONSTRUCTION] = partners.unflatten(decoded, styles)
+    samples = jnp.repeat(language.v_hat, 4 * config.samples, axis=0)
+    egos[TRUE_LANGUAGE], _ = _generate(haland, next(keys), samples, styles)
+    instructions = run.instructions()
+    spoken = {
+        TRAINING_SENTENCES: [list(style.train) for style in instructions.values()],
+        TEST_SENTENCES: [list(style.test) for style in instructions.values()],
+    }
+    translated, latents = {}, {}
+    for method, sentences in spoken.items():
+        translated[method] = translate_by_style(haland, sentences)
+        repeated = jnp.repeat(translated[method], config.samples, axis=1)
+        egos[method], latents[method] = _generate(
+            haland, next(keys), repeated.reshape(-1, repeated.shape[-1]), styles
+        )
+    results: dict[str, np.ndarray] = {}
+    for index, (method, policies) in enumerate(egos.items()):
+        if method == ORACLE:
+            results[method] = _own_partner(judge, next(keys), policies, held_out)
+        else:
+            results[method] = judge.with_held_out(next(keys), policies, held_out).mean(axis=2)
+        task.update(index + 1)
+    results[WRONG_SENTENCE] = wrong_sentences(
+        judge, next(keys), egos[TEST_SENTENCES], held_out
+    )
+    cross = cross_play(judge, next(keys), archive.egos.actor, held_out)
+    right = nearest_is_right(haland, translated[TEST_SENTENCES])
+    gate = policy_vae_gate(run, judge, next(keys))
+    return {
+        "methods": {
+            method: {
+                name: {"returns": by_style[i]} for i, name in enumerate(env.style_names)
+            }
+            for method, by_style in results.items()
+        },
+        "oracle": {name: results[ORACLE][i] for i, name in enumerate(env.style_names)},
+        "gates": gates(results, gate),
+        "policy_vae": gate,
+        "translator": {
+            "accuracy": float(right.mean()),
+            "by_style": dict(zip(env.style_names, right.mean(axis=1).tolist(), strict=True)),
+        },
+        "cross_play": cross,
+        "memorisation": memorisation(posterior.mean, latents[TEST_SENTENCES], haland),
+        "generation": time_generation(haland, instructions[env.style_names[0]].test[0]),
+        "task_language": {"events": list(language.event_names), "v_hat": language.v_hat},
+        "games": config.games,
+    }
+
+
+def translate_by_style(haland: Haland, sentences: Sequence[Sequence[str]]) -> jax.Array:
+    """Task language of equally many sentences a style, [style, sentence, U]."""
+    flat = [sentence for style in sentences for sentence in style]
+    v_hat, _ = haland.translate(flat)
+    return v_hat.reshape(len(sentences), -1, v_hat.shape[-1])
+
+
+def nearest_is_right(haland: Haland, v_hat: jax.Array) -> np.ndarray:
+    """Whether each translation is nearest to its own style's task language, [style, sentence]."""
+    found = np.asarray(haland.nearest_style(v_hat))
+    return found == np.arange(len(found))[:, None]
+
+
+def _generate(haland: Haland, key: jax.Array, v_hat: jax.Array, styles: int) -> tuple[Policy, Any]:
+    """One policy for each row [style * n, U]: policies [style, n], latents [style, n, D]."""
+    policies, latents = haland.generate_from_task_language(
+        v_hat, jax.random.split(key, v_hat.shape[0])
+    )
+    return partners.unflatten(policies, styles), partners.unflatten(latents, styles)
+
+
+def _own_partner(judge: Judge, key: jax.Array, egos: Policy, held_out: Policy) -> np.ndarray:
+    """Mean return of ego [style, seed] with the held-out partner of the same place."""
+    seeds = jax.tree.leaves(held_out)[0].shape[1]
+    returns = judge.with_held_out(key, egos, held_out)
+    return returns[:, np.arange(seeds), np.arange(seeds)]
+
+
+def wrong_sentences(judge: Judge, key: jax.Array, egos: Policy, held_out: Policy) -> np.ndarray:
+    """Mean return with egos made from the sentences of all *other* styles, [style, seed]."""
+    styles, count = jax.tree.leaves(egos)[0].shape[:2]
+    others = np.array([[j for j in range(styles) if j != i] for i in range(styles)])
+    # One ego of each other style, a different one for each style played with.
+    chosen = np.arange(styles)[:, None] % count
+    wrong = jax.tree.map(lambda leaf: leaf[others, chosen], egos)
+    return judge.with_held_out(key, wrong, held_out).mean(axis=2)
+
+
+def cross_play(judge: Judge, key: jax.Array, egos: Policy, held_out: Policy) -> np.ndarray:
+    """Mean return of the best responses to style i with held-out partners of style j, [i, j]."""
+    styles, count = jax.tree.leaves(egos)[0].shape[:2]
+    everyone = jax.tree.map(
+        lambda leaf: jnp.broadcast_to(
+            leaf.reshape(1, -1, *leaf.shape[2:]), (styles, styles * count, *leaf.shape[2:])
+        ),
+        egos,
+    )
+    returns = judge.with_held_out(key, everyone, held_out).mean(axis=1)
+    return returns.reshape(styles, styles, count).mean(axis=2).T
+
+
+def memorisation(archive: jax.Array, sampled: jax.Array, haland: Haland) -> dict[str, float]:
+    """How near generated latents lie to the archive's, in units of its spread.
+
+    Distances are root mean squares over the latent's dimensions, each divided by its standard
+    deviation over the archive.
+    """
+    std = np.asarray(haland.diffusion_params.statistics.std)
+    known = np.asarray(archive) / std
+    new = np.asarray(sampled).reshape(-1, known.shape[-1]) / std
+
+    def distances(a: np.ndarray, b: np.ndarray) -> np.ndarray:
+        return np.sqrt(((a[:, None] - b[None]) ** 2).mean(axis=-1))
+
+    among = distances(known, known) + 1e9 * np.eye(len(known))
+    return {
+        "nearest_training_latent": float(distances(new, known).min(axis=1).mean()),
+        "between_training_latents": float(among.min(axis=1).mean()),
+    }
+
+
+def time_generation(haland: Haland, sentence: str) -> dict[str, float]:
+    """Milliseconds from a sentence to a policy, compiled; the median of nine."""
+    found = {}
+    for sampler, times in (("ddim", 9), ("ddpm", 3)):
+        jax.block_until_ready(haland.generate(sentence, jax.random.key(0), sampler=sampler))
+        taken = []
+        for index in range(times):
+            start = time.perf_counter()
+            jax.block_until_ready(haland.generate(sentence, jax.random.key(index), sampler=sampler))
+            taken.append(1000 * (time.perf_counter() - start))
+        found[f"{sampler}_milliseconds"] = float(np.median(taken))
+    return found
+
+
+def share_of_oracle(returns: np.ndarray, oracle: np.ndarray) -> float:
+    """Mean over styles and held-out seeds of return / Oracle, where the Oracle earns anything."""
+    usable = oracle > 0
+    return float((returns[usable] / oracle[usable]).mean()) if usable.any() else 0.0
+
+
+def gates(results: Mapping[str, np.ndarray], vae: Mapping[str, Any]) -> dict[str, Any]:
+    """The bars that the method sets itself, with what was measured."""
+    oracle = results[ORACLE]
+
+    def at_least(value: float, bar: float) -> dict[str, Any]:
+        return {"value": value, "bar": bar, "met": bool(value >= bar)}
+
+    share = {method: share_of_oracle(values, oracle) for method, values in results.items()}
+    by_style = results[BEST_RESPONSE].mean(axis=1) / np.maximum(oracle.mean(axis=1), 1e-9)
+    wrong = share[WRONG_SENTENCE]
+    return {
+        "Oracle, lowest style's mean return": at_least(float(oracle.mean(axis=1).min()), 130.0),
+        "best responses / Oracle, mean": at_least(share[BEST_RESPONSE], 0.90),
+        "best responses / Oracle, lowest style": at_least(float(by_style.min()), 0.75),
+        "decoded / original policy, lowest": at_least(float(np.min(vae["decoded_share"])), 0.95),
+        "decoded / original policy, z perturbed, lowest": at_least(
+            float(np.min(vae["perturbed_share"])), 0.95
+        ),
+        "Haland from test sentences / Oracle": at_least(share[TEST_SENTENCES], 0.90),
+        "Haland from a wrong sentence / Oracle (at most)": {
+            "value": wrong,
+            "bar": 0.6,
+            "met": bool(wrong <= 0.6),
+        },
+    }

@@ -1,0 +1,121 @@
+"""The stages in order. Each reads artefacts and writes artefacts; a finished one is not run again."""
+
+import os
+import platform
+import time
+from pathlib import Path
+from typing import Any
+
+import jax
+import numpy as np
+
+from experiments import report
+from experiments.configs import RunConfig
+from experiments.evaluation import evaluate
+from experiments.gallery import record_episodes
+from experiments.progress import RunProgress
+from experiments.run_folder import RunFolder
+from experiments.stages import STAGES, Run
+
+EVALUATION, REPORT = "evaluation", "report"
+NUM_METHODS = 6
+
+
+def run_pipeline(config: RunConfig, path: Path) -> dict[str, Any]:
+    """Runs, or continues, everything from partners to report.
+
+    Args:
+        config: the run's configuration.
+        path: the run folder.
+
+    Returns:
+        The content of `results.json`.
+    """
+    names = (*STAGES, EVALUATION, REPORT)
+    with RunFolder.write(path, config) as folder, RunProgress(names, folder) as progress:
+        run = Run(config, folder, progress)
+        totals = _totals(config)
+        for name, stage in STAGES.items():
+            if folder.stage_done(name):
+                progress.skip(name)
+                continue
+            start = time.monotonic()
+            with progress.stage(name, totals[name]) as task:
+                metrics = stage(run, task)
+            folder.finish_stage(name, {**metrics, "seconds": time.monotonic() - start})
+        if folder.stage_done(EVALUATION):
+            progress.skip(EVALUATION)
+        else:
+            start = time.monotonic()
+            with progress.stage(EVALUATION, NUM_METHODS) as task:
+                measured = evaluate(run, task)
+            folder.finish_stage(EVALUATION, {**measured, "seconds": time.monotonic() - start})
+        results = collect_results(run)
+        folder.write_json("results.json", results)
+        if folder.stage_done(REPORT):
+            progress.skip(REPORT)
+        else:
+            with progress.stage(REPORT, len(run.env.style_names)) as task:
+                record_episodes(run, task)
+                report.write_report(results, path)
+            folder.finish_stage(REPORT, {})
+    return results
+
+
+def collect_results(run: Run) -> dict[str, Any]:
+    """Joins what the stages measured into the content of `results.json`."""
+    metrics = {name: run.folder.stage_metrics(name) for name in (*STAGES, EVALUATION)}
+    measured = dict(metrics[EVALUATION])
+    measured.pop("seconds")
+    return {
+        "environment": run.config.environment,
+        "preset": run.config.preset,
+        "seed": run.config.seed,
+        "styles": list(run.env.style_names),
+        **measured,
+        "curves": {
+            "steps": metrics["partners"]["curve_steps"],
+            "returns": metrics["partners"]["curve_returns"],
+        },
+        "partners": {
+            name: metrics["partners"][name]
+            for name in ("joint_returns", "kept_for_training", "kept_held_out")
+        },
+        "times": {name: values["seconds"] for name, values in metrics.items()},
+        "machine": describe_machine(),
+    }
+
+
+def describe_machine() -> dict[str, Any]:
+    """What the numbers were measured on."""
+    model = platform.processor()
+    cpuinfo = Path("/proc/cpuinfo")
+    if cpuinfo.exists():
+        names = [line for line in cpuinfo.read_text().splitlines() if line.startswith("model name")]
+        model = names[0].split(":", 1)[1].strip() if names else model
+    return {
+        "processor": model,
+        "cores": os.cpu_count(),
+        "devices": [str(device) for device in jax.devices()],
+        "python": platform.python_version(),
+        "jax": jax.__version__,
+        "date": time.strftime("%Y-%m-%d"),
+    }
+
+
+def _totals(config: RunConfig) -> dict[str, int]:
+    """Steps of each stage, in the units that its progress counts."""
+    translator = config.translator
+    return {
+        "partners": config.partners.joint.num_updates,
+        "best_responses": config.partners.refit.num_updates + config.partners.oracle.num_updates,
+        "task_language": 1,
+        "policy_vae": config.compression.fit.steps,
+        "diffusion": config.diffusion.fit.steps,
+        "translator": translator.fine_tuning.steps + translator.translation.steps,
+    }
+
+
+def mean_return(results: dict[str, Any], method: str) -> float:
+    """Mean return of a method over styles and held-out seeds."""
+    return float(np.mean([values["returns"] for values in results["methods"][method].values()]))

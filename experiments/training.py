@@ -1,0 +1,144 @@
+"""Long computations in pieces that can be interrupted: populations and supervised fits.
+
+Between two pieces the state may be saved; what is computed does not depend on when that
+happens, so a resumed run ends with the results of an uninterrupted one.
+"""
+
+import math
+import time
+from collections.abc import Callable
+from pathlib import Path
+from typing import Any
+
+import jax
+import numpy as np
+
+from envs.base import Environment
+from experiments.progress import StageProgress
+from haland_jax import checkpoint, fit, partners
+from haland_jax.fit import FitConfig, FitState
+from haland_jax.ppo import PPOConfig, TrainState
+
+SECONDS_BETWEEN_CHECKPOINTS = 20.0
+UPDATES_PER_PIECE = 25
+
+
+class Saver:
+    """Saves the state of a long computation now and then."""
+
+    def __init__(self, path: Path):
+        self.path = path
+        self._last = time.monotonic()
+
+    def restore(self, like: Any) -> Any | None:
+        """The state that an interrupted run left, or None."""
+        return checkpoint.restore(self.path, like) if checkpoint.exists(self.path) else None
+
+    def save_if_due(self, state: Any) -> None:
+        """Saves if the last save was long enough ago."""
+        if time.monotonic() - self._last >= SECONDS_BETWEEN_CHECKPOINTS:
+            checkpoint.save(self.path, state)
+            self._last = time.monotonic()
+
+
+def train_population(
+    env: Environment,
+    config: PPOConfig,
+    start: Callable[[], TrainState],
+    styles: Any,
+    saver: Saver,
+    report: Callable[[int, dict[str, float]], None],
+    stage: str,
+) -> tuple[TrainState, np.ndarray]:
+    """Trains a population to its end.
+
+    Args:
+        env: the environment.
+        config: settings.
+        start: makes the initial states, leading axis [member].
+        styles: style of each member.
+        saver: where interrupted training goes on from.
+        report: called with the updates done and the mean reward a step.
+        stage: for messages.
+
+    Returns:
+        The trained states, and the team reward a step of every update, [update, member].
+
+    Raises:
+        NonFiniteLoss: training diverged.
+    """
+    members = jax.tree.leaves(styles)[0].shape[0]
+    rewards = np.zeros((config.num_updates, members), np.float32)
+    state = start()
+    saved = saver.restore({"state": state, "rewards": rewards})
+    if saved is not None:
+        state, rewards = saved["state"], np.array(saved["rewards"])
+    state, styles = partners.place(state), partners.place(styles)
+    compiled: dict[int, Callable[..., Any]] = {}
+    done = int(np.asarray(state.update)[0])
+    while done < config.num_updates:
+        size = min(UPDATES_PER_PIECE, config.num_updates - done)
+        if size not in compiled:
+            compiled[size] = partners.compile_training(env, config, size)
+        state, metrics = compiled[size](state, styles)
+        metrics = {name: np.asarray(values).T for name, values in metrics.items()}
+        fit.check_finite(stage, done, metrics)
+        rewards[done : done + size] = metrics["reward"]
+        done += size
+        report(done, {"return": float(metrics["reward"].mean()) * env.max_steps})
+        saver.save_if_due({"state": state, "rewards": rewards})
+    return state, rewards
+
+
+def run_fit(
+    stage: str,
+    config: FitConfig,
+    chunk: Callable[[FitState, Any], tuple[FitState, dict[str, jax.Array]]],
+    state: FitState,
+    data: Any,
+    saver: Saver,
+    task: StageProgress,
+    *,
+    offset: int = 0,
+    refresh: Callable[[FitState, Any], Any] | None = None,
+) -> tuple[FitState, dict[str, np.ndarray]]:
+    """Runs a supervised fit to its end.
+
+    Args:
+        stage: for messages.
+        config: length of the fit.
+        chunk: what `fit.make_fit_chunk` returned.
+        state: the initial state.
+        data: data of the fit.
+        saver: where an interrupted fit goes on from.
+        task: progress of the stage.
+        offset: steps of the stage before this fit.
+        refresh: makes the next piece's data from the state (and the data so far).
+
+    Returns:
+        The final state, and the metrics of every chunk (means), [chunk].
+
+    Raises:
+        NonFiniteLoss: the fit diverged.
+    """
+    history: list[dict[str, float]] = []
+    saved = saver.restore({"state": state, "data": data})
+    if saved is not None:
+        state, data = saved["state"], saved["data"]
+    while int(state.step) < config.steps:
+        first = int(state.step)
+        state, metrics = chunk(state, data)
+        fit.check_finite(stage, first, metrics)
+        means = {name: float(np.mean(values)) for name, values in metrics.items()}
+        history.append(means)
+        task.update(offset + int(state.step), means)
+        if refresh is not None and int(state.step) < config.steps:
+            data = refresh(state, data)
+        saver.save_if_due({"state": state, "data": data})
+    names = history[0] if history else {}
+    return state, {name: np.array([m[name] for m in history]) for name in names}
+
+
+def largest_divisor(number: int, at_most: int) -> int:
+    """The largest divisor of a number that is not above a bound."""
+    return max(math.gcd(number, candidate) for candidate in range(1, at_most + 1))

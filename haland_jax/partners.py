@@ -1,0 +1,338 @@
+"""Styled partners and their best responses.
+
+1. Partner and ego learn together, many seeds of every style in one program (`init_pairs`).
+2. The best seeds of each style are kept, by one rule for training and held-out seeds alike
+   (`select_seeds`): partners that never learnt their style are no partners.
+3. Each training ego is refitted against *all* frozen training partners of its style
+   (`init_refits`): an ego that knew one partner only keeps that partner's private conventions.
+   These refitted egos are the archive.
+4. The Oracle of a held-out partner is the best of a few egos of its style refitted to that
+   very partner (`oracle_candidates`), chosen on other games than those it is scored on.
+
+Everything is flattened to members [style * seed] for `over_population`.
+"""
+
+import dataclasses
+from collections.abc import Callable
+from functools import partial
+from typing import Any
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+from flax.struct import PyTreeNode
+
+from envs.base import Environment
+from haland_jax import ppo, rollout
+from haland_jax.networks import Policy
+from haland_jax.population import over_population, share_out
+from haland_jax.ppo import PPOConfig, TrainState
+
+
+@dataclasses.dataclass(frozen=True)
+class PartnersConfig:
+    """How many partners, and how each stage trains.
+
+    Attributes:
+        train_seeds: partners of each style that the method learns from.
+        held_out_seeds: partners of each style that it is judged with.
+        spare_seeds: further seeds of each style that are trained and may be rejected.
+        joint: training of partner and ego together.
+        refit: training of an ego against all frozen training partners of its style.
+        oracle: training of an ego against one frozen held-out partner.
+        oracle_candidates: egos that are refitted for each held-out partner.
+        evaluation_games: games of each pair in an evaluation.
+    """
+
+    train_seeds: int = 5
+    held_out_seeds: int = 5
+    spare_seeds: int = 2
+    joint: PPOConfig = dataclasses.field(default_factory=PPOConfig)
+    refit: PPOConfig = dataclasses.field(
+        default_factory=lambda: PPOConfig(
+            total_steps=300_000, learning_rate=3e-4, entropy=0.01, shaping=0.0, confined_until=0.0
+        )
+    )
+    oracle: PPOConfig = dataclasses.field(
+        default_factory=lambda: PPOConfig(
+            total_steps=300_000, learning_rate=3e-4, entropy=0.01, shaping=0.0, confined_until=0.0
+        )
+    )
+    oracle_candidates: int = 3
+    evaluation_games: int = 32
+
+    def __post_init__(self):
+        for name in ("train_seeds", "held_out_seeds", "oracle_candidates", "evaluation_games"):
+            if getattr(self, name) < 1:
+                raise ValueError(f"{name} is {getattr(self, name)}; expected at least 1")
+        if self.refit.num_envs % self.train_seeds:
+            raise ValueError(
+                f"refit.num_envs is {self.refit.num_envs}; expected a multiple of "
+                f"train_seeds = {self.train_seeds}, since the partners share the games"
+            )
+
+    @property
+    def num_seeds(self) -> int:
+        """Seeds of each style that are trained."""
+        return self.train_seeds + self.held_out_seeds + self.spare_seeds
+
+
+class Player(PyTreeNode):
+    """What is kept of a learner: its actor, and its critic for later refits."""
+
+    actor: Policy
+    critic: Any
+
+
+class Population(PyTreeNode):
+    """The partners and egos of an environment; leading axes [style, seed].
+
+    Attributes:
+        train_partners: actors of the training partners.
+        held_out_partners: actors of the held-out partners.
+        train_egos: the egos that learnt beside the training partners.
+        held_out_egos: the egos that learnt beside the held-out partners.
+        joint_returns: mean return of every trained pair, rejected ones included,
+            float32 [style, num_seeds].
+        train_index: which of the trained seeds became training partners, int32.
+        held_out_index: which became held-out partners, int32.
+    """
+
+    train_partners: Policy
+    held_out_partners: Policy
+    train_egos: Player
+    held_out_egos: Player
+    joint_returns: jax.Array
+    train_index: jax.Array
+    held_out_index: jax.Array
+
+
+def flatten(tree: Any) -> Any:
+    """Merges the leading axes [style, seed] into [member]."""
+    return jax.tree.map(lambda leaf: leaf.reshape(-1, *leaf.shape[2:]), tree)
+
+
+def unflatten(tree: Any, num_styles: int) -> Any:
+    """Splits the leading axis [member] into [style, seed]."""
+    return jax.tree.map(lambda leaf: leaf.reshape(num_styles, -1, *leaf.shape[1:]), tree)
+
+
+def repeat_styles(env: Environment, times: int) -> Any:
+    """Returns the style of each member, leading axis [style * times]."""
+    return jax.tree.map(lambda leaf: jnp.repeat(leaf, times, axis=0), env.styles)
+
+
+def init_pairs(env: Environment, config: PartnersConfig, key: jax.Array) -> TrainState:
+    """Starts partner and ego of every style and seed.
+
+    All egos start from the same parameters: policies that share their initialisation are
+    near each other up to what they learnt, which the policy VAE needs.
+
+    Args:
+        env: the environment.
+        config: how many seeds.
+        key: consumed.
+
+    Returns:
+        Training states with leading axis [style * num_seeds].
+    """
+    ego_key, pair_key = jax.random.split(key)
+    actors, critic = ppo.make_networks(env)
+    sizes = env.observation_sizes
+    styles = repeat_styles(env, config.num_seeds)
+
+    def init_pair(ego_key, pair_key, style):
+        partner_key, train_key = jax.random.split(pair_key)
+        ego = ppo.init_learner(ego_key, actors.ego, critic, sizes.ego, config.joint)
+        partner = ppo.init_learner(partner_key, actors.partner, critic, sizes.partner, config.joint)
+        return ppo.init_train_state(env, config.joint, train_key, ego, partner, style)
+
+    keys = jax.random.split(pair_key, len(env.style_names) * config.num_seeds)
+    return over_population(init_pair, shared=1)(ego_key, keys, styles)
+
+
+def init_refits(
+    env: Environment,
+    config: PPOConfig,
+    key: jax.Array,
+    egos: Player,
+    partners: Policy,
+    styles: Any,
+) -> TrainState:
+    """Starts the refit of egos against frozen partners.
+
+    Args:
+        env: the environment.
+        config: settings of the refit.
+        key: consumed.
+        egos: where each refit starts, leading axis [member].
+        partners: frozen actors, leading axes [member, partner]; they share the games.
+        styles: style of each member.
+    """
+
+    def init_refit(key, ego, partners, style):
+        learner = ppo.learner_from(ego.actor, ego.critic, config)
+        return ppo.init_train_state(env, config, key, learner, partners, style)
+
+    keys = jax.random.split(key, jax.tree.leaves(styles)[0].shape[0])
+    return over_population(init_refit)(keys, egos, partners, styles)
+
+
+def compile_training(
+    env: Environment, config: PPOConfig, num_updates: int
+) -> Callable[[TrainState, Any], tuple[TrainState, dict[str, jax.Array]]]:
+    """Compiles `ppo.train_chunk` for a population; the given state is consumed."""
+    return over_population(partial(ppo.train_chunk, env, config, num_updates), donate=(0,))
+
+
+def compile_evaluation(
+    env: Environment, num_games: int
+) -> Callable[[jax.Array, Policy, Policy, Any], rollout.Games]:
+    """Compiles the evaluation of pairs: keys, egos, partners, styles [member] -> `Games`."""
+    return over_population(partial(rollout.play, env, num_games=num_games))
+
+
+def select_seeds(
+    returns: np.ndarray, num_train: int, num_held_out: int
+) -> tuple[np.ndarray, np.ndarray]:
+    """Keeps the best seeds of each style and deals them out.
+
+    The seeds with the highest returns are kept; by rank they go in turn to the training and
+    to the held-out partners, so that neither group is the better one by choice.
+
+    Args:
+        returns: mean return of each pair, [style, seed].
+        num_train: training partners of each style.
+        num_held_out: held-out partners of each style.
+
+    Returns:
+        Indices of seeds, int32 [style, num_train] and [style, num_held_out].
+    """
+    kept = np.argsort(-returns, axis=1, kind="stable")[:, : num_train + num_held_out]
+    train, held_out = [], []
+    for rank in range(kept.shape[1]):
+        wants_train = len(train) * num_held_out <= len(held_out) * num_train
+        (train if wants_train and len(train) < num_train else held_out).append(rank)
+    while len(held_out) > num_held_out:
+        train.append(held_out.pop())
+    return kept[:, sorted(train)].astype(np.int32), kept[:, held_out].astype(np.int32)
+
+
+def take_seeds(tree: Any, index: np.ndarray) -> Any:
+    """Picks seeds by style: leaves [style, seed, ...], index [style, n] -> [style, n, ...]."""
+    rows = np.arange(index.shape[0])[:, None]
+    return jax.tree.map(lambda leaf: leaf[rows, index], tree)
+
+
+def make_population(
+    env: Environment, config: PartnersConfig, state: TrainState, returns: np.ndarray
+) -> Population:
+    """Keeps the best pairs.
+
+    Args:
+        env: the environment.
+        config: how many.
+        state: the trained pairs, leading axis [style * num_seeds].
+        returns: mean return of each pair, [style, num_seeds].
+    """
+    num_styles = len(env.style_names)
+    train, held_out = select_seeds(returns, config.train_seeds, config.held_out_seeds)
+    egos = unflatten(Player(state.ego.actor, state.ego.critic), num_styles)
+    partners = unflatten(state.partner.actor, num_styles)
+    return Population(
+        train_partners=take_seeds(partners, train),
+        held_out_partners=take_seeds(partners, held_out),
+        train_egos=take_seeds(egos, train),
+        held_out_egos=take_seeds(egos, held_out),
+        joint_returns=jnp.asarray(returns),
+        train_index=jnp.asarray(train),
+        held_out_index=jnp.asarray(held_out),
+    )
+
+
+def best_response_refits(
+    env: Environment, config: PartnersConfig, key: jax.Array, population: Population
+) -> TrainState:
+    """Starts the refits that become the archive, leading axis [style * train_seeds]."""
+    times = config.train_seeds
+    partners = jax.tree.map(
+        lambda leaf: jnp.repeat(leaf[:, None], times, axis=1), population.train_partners
+    )
+    return init_refits(
+        env,
+        config.refit,
+        key,
+        flatten(population.train_egos),
+        flatten(partners),
+        repeat_styles(env, times),
+    )
+
+
+def oracle_refits(
+    env: Environment,
+    config: PartnersConfig,
+    key: jax.Array,
+    population: Population,
+    archived: Player,
+) -> TrainState:
+    """Starts the Oracle's candidates, leading axis [style * held_out_seeds * candidates].
+
+    The candidates of a held-out partner are its own ego and archived best responses of its
+    style (in turn), so that no archived ego can beat the Oracle but by chance.
+
+    Args:
+        env: the environment.
+        config: how many candidates.
+        key: consumed.
+        population: the held-out partners and their egos.
+        archived: the refitted egos, leading axes [style, train_seeds].
+    """
+    others = config.oracle_candidates - 1
+    seeds = config.held_out_seeds
+    chosen = (np.arange(seeds)[:, None] + np.arange(others)) % config.train_seeds
+
+    def candidates(own: jax.Array, archive: jax.Array) -> jax.Array:
+        return jnp.concatenate([own[:, :, None], archive[:, chosen]], axis=2)
+
+    egos = jax.tree.map(candidates, population.held_out_egos, archived)
+    partners = jax.tree.map(
+        lambda leaf: jnp.repeat(leaf[:, :, None, None], config.oracle_candidates, axis=2),
+        population.held_out_partners,
+    )
+    return init_refits(
+        env,
+        config.oracle,
+        key,
+        flatten(flatten(egos)),
+        flatten(flatten(partners)),
+        repeat_styles(env, seeds * config.oracle_candidates),
+    )
+
+
+def visited_observations(
+    env: Environment,
+    key: jax.Array,
+    ego: Policy,
+    partner: Policy,
+    style: Any,
+    *,
+    num_games: int,
+    num_kept: int,
+) -> jax.Array:
+    """Returns observations of the ego in games with a partner, drawn at random, [num_kept, O].
+
+    Observations after a game's end are never drawn (where any game lasted long enough).
+    """
+    game_key, draw_key = jax.random.split(key)
+    games = jax.vmap(lambda k: rollout.record(env, k, ego, partner, style))(
+        jax.random.split(game_key, num_games)
+    )
+    observations = games.observations.ego.reshape(-1, games.observations.ego.shape[-1])
+    alive = games.alive.reshape(-1).astype(jnp.float32)
+    drawn = jax.random.choice(draw_key, alive.shape[0], (num_kept,), p=alive / jnp.sum(alive))
+    return observations[drawn]
+
+
+def place(population: Any) -> Any:
+    """Puts a population onto the devices."""
+    return share_out(population)
