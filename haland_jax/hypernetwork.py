@@ -114,6 +114,18 @@ class HypernetworkConfig:
             )
 
 
+class GatedStep(nn.Module):
+    """A node takes in its neighbour's message and sends its own, [hidden] each."""
+
+    hidden: int
+
+    @nn.compact
+    def __call__(self, message: Array, state: Array) -> tuple[Array, Array]:
+        state, _ = nn.GRUCell(self.hidden, name="cell")(state, message)
+        message = nn.silu(nn.Dense(self.hidden, name="message_0")(state))
+        return nn.Dense(self.hidden, name="message_1")(message), state
+
+
 class Sweeps(nn.Module):
     """One forward and one backward gated sweep over the chain: [node, hidden] -> the same.
 
@@ -125,16 +137,12 @@ class Sweeps(nn.Module):
 
     @nn.compact
     def __call__(self, states: Array) -> Array:
-        message_0 = nn.Dense(self.hidden, name="message_0")
-        message_1 = nn.Dense(self.hidden, name="message_1")
-        cell = nn.GRUCell(self.hidden, name="cell")
-        nodes = list(states)
-        for order in (range(len(nodes)), reversed(range(len(nodes)))):
-            incoming = jnp.zeros(self.hidden)
-            for index in order:
-                nodes[index], _ = cell(nodes[index], incoming)
-                incoming = message_1(nn.silu(message_0(nodes[index])))
-        return jnp.stack(nodes)
+        scanned = nn.scan(GatedStep, variable_broadcast="params", split_rngs={"params": False})
+        sweep = scanned(self.hidden, name="step")
+        silence = jnp.zeros(self.hidden)
+        _, states = sweep(silence, states)
+        _, states = sweep(silence, states[::-1])
+        return states[::-1]
 
 
 class Head(nn.Module):
