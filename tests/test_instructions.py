@@ -1,0 +1,104 @@
+"""The sentence files: complete for every kitchen, and checked when they are read."""
+
+from pathlib import Path
+
+import pytest
+
+from envs.instructions import load_instructions, read_instructions
+
+ORDERS = tuple(f"{soup}_{cell}" for soup in ("onion", "tomato") for cell in (1, 2, 3, 4))
+CORNERS = ("upper_left", "upper_right", "lower_left", "lower_right")
+STYLES = {
+    "center_pots": ("left", "right", "upper", "lower", *CORNERS),
+    "crossway": (*CORNERS, "upper_no_dish", "lower_no_dish", "deliver_left", "deliver_right"),
+    "diverse_coordination": tuple(
+        f"{side}_{rule}"
+        for side in ("left", "right")
+        for rule in ("no_onion", "no_dish", "no_onion_no_dish", "no_delivery")
+    ),
+    "diverse_orders": ORDERS,
+}
+GOOD = '[left]\ntrain = ["Go left."]\ntest = ["To the left."]\n'
+
+
+def write(folder: Path, text: str) -> Path:
+    path = folder / "kitchen.toml"
+    path.write_text(text, encoding="utf-8")
+    return path
+
+
+@pytest.mark.parametrize("environment", sorted(STYLES))
+def test_every_kitchen_has_ten_training_and_four_test_sentences(environment):
+    instructions = load_instructions(f"overcooked/{environment}", STYLES[environment])
+    assert tuple(instructions) == STYLES[environment]
+    for style, sentences in instructions.items():
+        assert len(sentences.train) == 10, style
+        assert len(sentences.test) == 4, style
+
+
+@pytest.mark.parametrize("environment", sorted(STYLES))
+def test_sentences_name_what_their_style_is_about(environment):
+    words = {
+        "left": ("left",),
+        "right": ("right",),
+        "upper": ("upper", "top", "above", " up ", "up "),
+        "lower": ("lower", "bottom", "below", "down"),
+        "onion": ("onion",),
+        "tomato": ("tomato",),
+        "dish": ("dish", "plate"),
+        "delivery": ("serv", "deliver", "hand in", "to the window", "carrying soup out", "pass"),
+        "deliver": ("serv", "deliver", "bring", "carry soup", "hand in", "waiter", "drop"),
+        "1": ("1", "one", "first", "leftmost"),
+        "2": ("2", "two", "second"),
+        "3": ("3", "three", "third"),
+        "4": ("4", "four", "fourth", "rightmost"),
+    }
+    for style, (train, test) in load_instructions(environment).items():
+        for part in style.replace("no_", "").split("_"):
+            for sentence in (*train, *test):
+                assert any(word in sentence.lower() for word in words[part]), (style, sentence)
+
+
+def test_the_environment_prefix_may_be_left_out():
+    assert load_instructions("crossway") == load_instructions("overcooked/crossway")
+
+
+def test_the_result_follows_the_order_of_the_style_names(tmp_path):
+    path = write(tmp_path, GOOD + GOOD.replace("left", "right"))
+    assert tuple(read_instructions(path, ("right", "left"))) == ("right", "left")
+
+
+def test_an_unknown_environment_is_refused():
+    with pytest.raises(ValueError, match="no instructions for environment 'overcooked/nowhere'"):
+        load_instructions("overcooked/nowhere")
+
+
+@pytest.mark.parametrize(
+    ("text", "message"),
+    [
+        ("[left\n", "no valid TOML"),
+        ("", "at least one"),
+        ('[left]\ntrain = ["Go left."]\n', "expected the two lists train and test"),
+        ('[left]\ntrain = ["Go left."]\ntest = ["A."]\nmore = ["B."]\n', "found train, test, more"),
+        ('left = "Go left."\n', "expected the two lists"),
+        ('[left]\ntrain = []\ntest = ["To the left."]\n', "train must be a list of at least one"),
+        ('[left]\ntrain = ["Go left."]\ntest = "To the left."\n', "test must be a list"),
+        ('[left]\ntrain = ["Go left.", "  "]\ntest = ["A."]\n', "train holds '  '"),
+        ('[left]\ntrain = ["Go left.", "Go left."]\ntest = ["A."]\n', "occurs twice"),
+        ('[left]\ntrain = ["Go left."]\ntest = ["go  LEFT."]\n', "in .left. train and .left. test"),
+        (GOOD + GOOD.replace("[left]", "[right]"), "in .left. train and .right. train"),
+    ],
+)
+def test_inconsistent_files_are_refused(tmp_path, text, message):
+    with pytest.raises(ValueError, match=message) as caught:
+        read_instructions(write(tmp_path, text))
+    assert "\n" not in str(caught.value)
+
+
+@pytest.mark.parametrize(
+    ("names", "message"),
+    [(("left", "right"), "missing: right; extra: none"), (("right",), "extra: left")],
+)
+def test_missing_and_extra_styles_are_named(tmp_path, names, message):
+    with pytest.raises(ValueError, match=message):
+        read_instructions(write(tmp_path, GOOD), names)
