@@ -1,0 +1,6 @@
+"""Commands, presets, stages, figures and benchmarks."""
+
+import os
+
+# XLA reports on every program that it loads from the compilation cache; read once, at start.
+os.environ.setdefault("TF_CPP_MIN_LOG_LEVEL", "3")

@@ -108,9 +108,7 @@ def smoke(environment: str, seed: int) -> RunConfig:
 
     `python -m experiments.run --preset smoke`; about two minutes on two CPU cores.
     """
-    tiny = PPOConfig(
-        total_steps=1280, num_envs=8, rollout_steps=20, num_minibatches=2, epochs=1
-    )
+    tiny = PPOConfig(total_steps=1280, num_envs=8, rollout_steps=20, num_minibatches=2, epochs=1)
     refit = dataclasses.replace(tiny, total_steps=640, shaping=0.0, confined_until=0.0)
     return RunConfig(
         environment=environment,
@@ -163,7 +161,7 @@ def quick(environment: str, seed: int) -> RunConfig:
             train_seeds=2,
             held_out_seeds=2,
             spare_seeds=0,
-            joint=PPOConfig(total_steps=600_000),
+            joint=PPOConfig(total_steps=800_000),
             refit=_refit(200_000),
             oracle=_refit(200_000),
             oracle_candidates=2,

@@ -95,15 +95,18 @@ def policy_vae_gate(run: Run, judge: Judge, key: jax.Array) -> dict[str, Any]:
         "perturbed": policy_vae.decode(vae, params, perturbed),
     }
     repeats = max(1, run.config.compression.gate_games // run.config.evaluation.games)
-    everyone = jax.tree.map(lambda leaf: jnp.tile(leaf, (1, repeats) + (1,) * (leaf.ndim - 2)),
-                            population.train_partners)
+    everyone = jax.tree.map(
+        lambda leaf: jnp.tile(leaf, (1, repeats) + (1,) * (leaf.ndim - 2)),
+        population.train_partners,
+    )
     earned = {}
     for name, policies in versions.items():
         by_style = partners.unflatten(policies, len(env.style_names))
         returns = judge.with_held_out(play_key, by_style, everyone)
         earned[name] = returns.mean(axis=1)
     shares = {
-        name: earned[name] / np.maximum(earned["original"], 1e-9) for name in ("decoded", "perturbed")
+        name: earned[name] / np.maximum(earned["original"], 1e-9)
+        for name in ("decoded", "perturbed")
     }
     return {
         "partners": times,
@@ -151,17 +154,13 @@ def evaluate(run: Run, task: StageProgress) -> dict[str, Any]:
         else:
             results[method] = judge.with_held_out(next(keys), policies, held_out).mean(axis=2)
         task.update(index + 1)
-    results[WRONG_SENTENCE] = wrong_sentences(
-        judge, next(keys), egos[TEST_SENTENCES], held_out
-    )
+    results[WRONG_SENTENCE] = wrong_sentences(judge, next(keys), egos[TEST_SENTENCES], held_out)
     cross = cross_play(judge, next(keys), archive.egos.actor, held_out)
     right = nearest_is_right(haland, translated[TEST_SENTENCES])
     gate = policy_vae_gate(run, judge, next(keys))
     return {
         "methods": {
-            method: {
-                name: {"returns": by_style[i]} for i, name in enumerate(env.style_names)
-            }
+            method: {name: {"returns": by_style[i]} for i, name in enumerate(env.style_names)}
             for method, by_style in results.items()
         },
         "oracle": {name: results[ORACLE][i] for i, name in enumerate(env.style_names)},
@@ -289,9 +288,10 @@ def gates(results: Mapping[str, np.ndarray], vae: Mapping[str, Any]) -> dict[str
             float(np.min(vae["perturbed_share"])), 0.95
         ),
         "Haland from test sentences / Oracle": at_least(share[TEST_SENTENCES], 0.90),
-        "Haland from a wrong sentence / Oracle (at most)": {
+        "Haland from a wrong sentence / Oracle": {
             "value": wrong,
             "bar": 0.6,
+            "at_most": True,
             "met": bool(wrong <= 0.6),
         },
     }

@@ -100,8 +100,12 @@ def summary_table(results: Mapping[str, Any]) -> Table:
         table.add_row(row.method, *_numbers(row), style=style)
     for name, gate in results.get("gates", {}).items():
         verdict = "[green]met[/]" if gate["met"] else "[red]missed[/]"
-        table.add_row(f"gate: {name}", _number(gate["value"]), f"≥ {_number(gate['bar'])}", verdict)
+        table.add_row(f"gate: {name}", _number(gate["value"]), _bar(gate), verdict)
     return table
+
+
+def _bar(gate: Mapping[str, Any]) -> str:
+    return f"{'≤' if gate.get('at_most') else '≥'} {_number(gate['bar'])}"
 
 
 def _opening(results: Mapping[str, Any]) -> str:
@@ -161,7 +165,7 @@ def _gates(results: Mapping[str, Any]) -> str:
     if not results.get("gates"):
         return ""
     rows = [
-        (name, _number(gate["value"]), _number(gate["bar"]), "met" if gate["met"] else "**missed**")
+        (name, _number(gate["value"]), _bar(gate), "met" if gate["met"] else "**missed**")
         for name, gate in results["gates"].items()
     ]
     return (

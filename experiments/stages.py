@@ -104,9 +104,7 @@ def make_partners(run: Run, task: StageProgress) -> dict[str, Any]:
         "kept_for_training": np.asarray(population.train_index),
         "kept_held_out": np.asarray(population.held_out_index),
         "curve_steps": points[1:] * config.joint.steps_per_update,
-        "curve_returns": {
-            name: by_style[:, index].T for index, name in enumerate(env.style_names)
-        },
+        "curve_returns": {name: by_style[:, index].T for index, name in enumerate(env.style_names)},
     }
 
 
@@ -319,9 +317,7 @@ class Visits:
         env, times = self.run.env, self.run.config.partners.train_seeds
         if number not in self._programs:
             self._programs[number] = over_population(
-                partial(
-                    partners.visited_observations, env, num_games=VISIT_GAMES, num_kept=number
-                )
+                partial(partners.visited_observations, env, num_games=VISIT_GAMES, num_kept=number)
             )
         rolled = jax.tree.map(lambda leaf: jnp.roll(leaf, shift, axis=0), self.partners)
         styles = partners.repeat_styles(env, times)

@@ -60,8 +60,8 @@ class PPOConfig:
     value_weight: float = 0.5
     max_gradient_norm: float = 0.5
     reward_scale: float = 0.1
-    shaping: float = 1.0
-    shaping_until: float = 0.7
+    shaping: float = 3.0
+    shaping_until: float = 0.85
     confined_until: float = 0.55
 
     def __post_init__(self):
@@ -271,7 +271,9 @@ def _update(
 
     actors, critic = make_networks(env)
     shaping = config.shaping * jnp.maximum(0.0, 1 - progress / config.shaping_until)
-    scaled = config.reward_scale * (steps["reward"] + shaping * jnp.moveaxis(steps["shaped"], -1, 0))
+    scaled = config.reward_scale * (
+        steps["reward"] + shaping * jnp.moveaxis(steps["shaped"], -1, 0)
+    )
     rates = {
         "learning_rate": _falling(config.learning_rate, config.final_learning_rate, progress),
         "entropy_weight": _falling(config.entropy, config.final_entropy, progress),

@@ -23,22 +23,20 @@ NUM_CONTENTS = 16
 class ShapingWeights:
     """Weights of the guided shaping, in units of the team reward (a soup pays 20).
 
-    `potting` (of the second ingredient; the first earns half, the third one and a half times
-    as much), `dish` and `soup_taken` are the reference's. Starting an unfinished pot costs
-    little: taking back all that its ingredients paid kept random players from ever learning
-    to use the pot, which they start by accident all the time.
+    `potting`, `dish` and `soup_taken` are the reference's, but a soup that nobody ordered
+    earns less when it is taken from the pot. Starting an unfinished pot costs nothing: any
+    fine keeps random players, who start the pot by accident all the time, from learning to
+    use it at all (measured: docs/paper_map.md).
     """
 
     potting: float = 3.0
-    potting_growth: float = 0.0
     dish: float = 3.0
     soup_taken: float = 5.0
     unordered_soup_taken: float = 2.0
     start_full: float = 1.0
-    start_unfinished: float = 0.0
     spoilt: float = -1.0
     unpaid_delivery: float = -1.0
-    hand_over: float = 1.0
+    hand_over: float = 2.0
 
 
 def order_values(orders: tuple[int, ...], soup_reward: float = 20.0) -> np.ndarray:
@@ -145,7 +143,6 @@ def guided_shaping_terms(
     viable = reachable[jnp.minimum(did.content + ingredient, NUM_CONTENTS - 1)] > 0
     complete = soup_values[did.content] > 0
     started = did.change == dynamics.COOKING_STARTED
-    amount = dynamics.num_ingredients(did.content)
     taken = did.change == dynamics.SOUP_TAKEN
     delivered = did.change == dynamics.DELIVERED
     unpaid = delivered & (delivery_reward(layout, did, pays) == 0)
@@ -156,11 +153,10 @@ def guided_shaping_terms(
     put = did.change == dynamics.PUT_ON_COUNTER
     picked = did.change == dynamics.TAKEN_FROM_COUNTER
     return {
-        "potting": weights.potting * (potted & viable) * (1 + weights.potting_growth * (amount - 1) / 2),
+        "potting": weights.potting * (potted & viable),
         "spoilt": weights.spoilt * (potted & ~viable),
         "dish": weights.dish * useful_dishes(layout, transition),
         "start_full": weights.start_full * (started & complete),
-        "start_unfinished": weights.start_unfinished * (started & ~complete),
         "soup_taken": weights.soup_taken * (taken & complete),
         "unordered_soup_taken": weights.unordered_soup_taken * (taken & ~complete),
         "unpaid_delivery": weights.unpaid_delivery * unpaid,

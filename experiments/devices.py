@@ -1,0 +1,28 @@
+"""Prepares JAX for a command: one device for each core of a CPU, and a lasting compilation cache."""
+
+import os
+from pathlib import Path
+
+import jax
+
+
+def prepare(*, cores: int | None = None) -> None:
+    """Configures JAX; call it before the first computation.
+
+    A population is shared out over all devices. One XLA program does not fill a CPU's cores by
+    itself, so the host is split into one device a core (at most 8). Compiled programs are kept
+    in the cache folder, so that the next command does not compile them again.
+
+    Args:
+        cores: host devices to make; one for each core this process may use by default.
+    """
+    if cores is None:
+        usable = (
+            len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count()
+        )
+        cores = min(8, usable or 1)
+    jax.config.update("jax_num_cpu_devices", cores)
+    cache = Path(os.environ.get("XDG_CACHE_HOME", Path.home() / ".cache")) / "haland-jax"
+    if not os.environ.get("JAX_COMPILATION_CACHE_DIR"):
+        jax.config.update("jax_compilation_cache_dir", str(cache))
+    jax.config.update("jax_persistent_cache_min_compile_time_secs", 0.5)

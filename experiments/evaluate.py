@@ -1,0 +1,178 @@
+"""Held-out partners, any sentences.
+
+    python -m experiments.evaluate RUN
+    python -m experiments.evaluate RUN --instructions mine.toml --json out.json
+
+FILE is TOML, style name = list of sentences:
+
+    left_no_onion = ["I'll cook on the left, you bring the onions."]
+"""
+
+import dataclasses
+import json
+import tomllib
+from pathlib import Path
+from typing import Annotated, Any
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import tyro
+from rich.console import Console
+from rich.table import Table
+
+from experiments import devices
+from experiments.errors import UserError, as_user_error, choose, main_guard
+
+
+@dataclasses.dataclass(frozen=True)
+class Arguments:
+    """Measure agents made from sentences with the held-out partners of a finished run."""
+
+    run: tyro.conf.Positional[Path]
+    """Folder of a finished run."""
+    instructions: Annotated[Path | None, tyro.conf.arg(metavar="FILE")] = None
+    """TOML file: style name = list of sentences; the packaged test sentences by default."""
+    json: Annotated[Path | None, tyro.conf.arg(metavar="OUT")] = None
+    """Write the result as JSON too."""
+    games: int = 16
+    """Games of each policy and held-out partner."""
+    seed: int = 0
+    """Seed of generation and play."""
+
+
+def read_sentences(path: Path, style_names: tuple[str, ...]) -> dict[str, list[str]]:
+    """Reads a file of sentences by style.
+
+    Raises:
+        UserError: the file is missing or no TOML, names an unknown style, or holds something
+            else than lists of sentences.
+    """
+    try:
+        content = tomllib.loads(path.read_text(encoding="utf-8"))
+    except OSError as error:
+        raise UserError(f"{path} cannot be read ({error.strerror}); name a TOML file") from None
+    except (tomllib.TOMLDecodeError, UnicodeDecodeError) as error:
+        raise UserError(f'{path} is no TOML file ({error}); write: style = ["sentence"]') from None
+    if not content:
+        raise UserError(f'{path} holds no sentences; write: {style_names[0]} = ["sentence"]')
+    for style, sentences in content.items():
+        choose("style", style, style_names)
+        if isinstance(sentences, dict) and "test" in sentences:
+            sentences = content[style] = sentences["test"]
+        if (
+            not isinstance(sentences, list)
+            or not sentences
+            or not all(isinstance(sentence, str) for sentence in sentences)
+        ):
+            raise UserError(f"{path}: {style} must be a list of at least one sentence in quotes")
+    return content
+
+
+def measure(run: Any, sentences: dict[str, list[str]], games: int, seed: int) -> dict[str, Any]:
+    """Plays one policy a sentence with every held-out partner of the sentence's style."""
+    from experiments.evaluation import Judge
+    from experiments.stages import load_archive, load_haland, load_population
+
+    haland, population, archive = load_haland(run), load_population(run), load_archive(run)
+    env = run.env
+    judge = Judge(env, games, run.config.evaluation.batch)
+    generate_key, play_key, oracle_key = jax.random.split(jax.random.key(seed), 3)
+    rows = [(env.style_names.index(style), s) for style, found in sentences.items() for s in found]
+    with as_user_error():
+        v_hat, _ = haland.translate([sentence for _, sentence in rows])
+    nearest = np.asarray(haland.nearest_style(v_hat))
+    policies, _ = haland.generate_from_task_language(
+        v_hat, jax.random.split(generate_key, len(rows))
+    )
+    seeds = run.config.partners.held_out_seeds
+    style_rows = np.repeat([style for style, _ in rows], seeds)
+    seed_rows = np.tile(np.arange(seeds), len(rows))
+
+    def play(key: jax.Array, egos: Any) -> np.ndarray:
+        partner = jax.tree.map(
+            lambda leaf: leaf[style_rows, seed_rows], population.held_out_partners
+        )
+        styles = jax.tree.map(lambda leaf: leaf[style_rows], env.styles)
+        return judge.returns(key, egos, partner, styles).reshape(len(rows), seeds)
+
+    returns = play(play_key, jax.tree.map(lambda leaf: jnp.repeat(leaf, seeds, axis=0), policies))
+    oracle = play(
+        oracle_key, jax.tree.map(lambda leaf: leaf[style_rows, seed_rows], archive.oracles)
+    )
+    found: dict[str, Any] = {}
+    for style in sentences:
+        index = env.style_names.index(style)
+        mine = np.array([i for i, (of, _) in enumerate(rows) if of == index])
+        usable = oracle[mine].mean(axis=0) > 0
+        ratio = returns[mine].mean(axis=0)[usable] / oracle[mine].mean(axis=0)[usable]
+        found[style] = {
+            "accuracy": float((nearest[mine] == index).mean()),
+            "return": float(returns[mine].mean()),
+            "oracle": float(oracle[mine].mean()),
+            "share_of_oracle": float(ratio.mean()) if usable.any() else None,
+            "sentences": [
+                {
+                    "sentence": rows[i][1],
+                    "translated_to": env.style_names[nearest[i]],
+                    "return": float(returns[i].mean()),
+                }
+                for i in mine
+            ],
+        }
+    shares = [f["share_of_oracle"] for f in found.values() if f["share_of_oracle"] is not None]
+    return {
+        "environment": run.config.environment,
+        "games": games,
+        "styles": found,
+        "mean": {
+            "accuracy": float(np.mean([f["accuracy"] for f in found.values()])),
+            "return": float(np.mean([f["return"] for f in found.values()])),
+            "share_of_oracle": float(np.mean(shares)) if shares else None,
+        },
+    }
+
+
+def table_of(found: dict[str, Any]) -> Table:
+    """The result by style as a table for the terminal."""
+    table = Table(title=f"Held-out partners, {found['environment']}")
+    table.add_column("style")
+    for column in ("sentences", "translated right", "return", "return / Oracle"):
+        table.add_column(column, justify="right")
+
+    def row(name: str, values: dict[str, Any], count: str) -> None:
+        share = values["share_of_oracle"]
+        shown = "–" if share is None else f"{share:.2f}"
+        table.add_row(name, count, f"{values['accuracy']:.0%}", f"{values['return']:.1f}", shown)
+
+    for style, values in found["styles"].items():
+        row(style, values, str(len(values["sentences"])))
+    table.add_section()
+    row("mean", found["mean"], "")
+    return table
+
+
+@main_guard
+def main() -> None:
+    """The command."""
+    arguments = tyro.cli(Arguments, prog="python -m experiments.evaluate")
+    devices.prepare()
+    from experiments.finished_run import open_run
+
+    if arguments.games < 1:
+        raise UserError(f"games is {arguments.games}; expected at least 1")
+    if arguments.json is not None and not arguments.json.absolute().parent.is_dir():
+        raise UserError(f"the folder of {arguments.json} does not exist; make it first")
+    run = open_run(arguments.run)
+    if arguments.instructions is not None:
+        sentences = read_sentences(arguments.instructions, run.env.style_names)
+    else:
+        sentences = {name: list(style.test) for name, style in run.instructions().items()}
+    found = measure(run, sentences, arguments.games, arguments.seed)
+    Console().print(table_of(found))
+    if arguments.json is not None:
+        arguments.json.write_text(json.dumps(found, indent=1) + "\n", encoding="utf-8")
+
+
+if __name__ == "__main__":
+    main()

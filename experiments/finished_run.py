@@ -1,0 +1,58 @@
+"""Opens a run that was made earlier, to generate policies from it."""
+
+import dataclasses
+from pathlib import Path
+from typing import Any
+
+from experiments.configs import PRESETS, RunConfig
+from experiments.errors import UserError
+from experiments.progress import RunProgress
+from experiments.run_folder import RunFolder, to_json
+from experiments.stages import STAGES, Run
+
+
+def open_run(path: Path) -> Run:
+    """Opens a run whose stages are all finished.
+
+    Args:
+        path: the run folder.
+
+    Raises:
+        UserError: there is no finished run, or it was made by another version's preset.
+    """
+    folder = RunFolder.read(path, tuple(STAGES))
+    return Run(_configuration(path, folder.configuration), folder, RunProgress(()))
+
+
+def _configuration(path: Path, stored: dict[str, Any]) -> RunConfig:
+    """The run's configuration as dataclasses, from its config.json."""
+    template = PRESETS.get(stored.get("preset", ""))
+    if template is None:
+        raise UserError(
+            f"the run in {path} has the preset {stored.get('preset')!r}; expected one of "
+            f"{', '.join(PRESETS)}"
+        )
+    try:
+        return _filled(template(stored["environment"], stored["seed"]), stored)
+    except (KeyError, TypeError, ValueError) as error:
+        raise UserError(
+            f"config.json of the run in {path} does not fit this version ({error}); make the run "
+            "again"
+        ) from error
+
+
+def _filled(template: Any, stored: dict[str, Any]) -> Any:
+    """A copy of a dataclass with the stored values; nested dataclasses likewise."""
+    changes = {}
+    for field in dataclasses.fields(template):
+        value, kept = getattr(template, field.name), stored[field.name]
+        if dataclasses.is_dataclass(value):
+            changes[field.name] = _filled(value, kept)
+        elif isinstance(value, tuple):
+            changes[field.name] = tuple(kept)
+        else:
+            changes[field.name] = kept
+    filled = dataclasses.replace(template, **changes)
+    if to_json(filled) != stored:
+        raise ValueError("a setting is unknown")
+    return filled

@@ -1,0 +1,104 @@
+"""Pictures of play: one episode a style, generated from a test sentence, with a held-out partner."""
+
+from pathlib import Path
+from typing import Any
+
+import jax
+import numpy as np
+
+from envs.overcooked import viewer
+from experiments.progress import StageProgress
+from experiments.stages import Run, load_haland, load_population
+from haland_jax import rollout
+from haland_jax.rollout import Recording
+
+EPISODES = "figures/episodes"
+GIF_STEPS = 200
+GAMES_TO_CHOOSE_FROM = 5
+
+
+def record_episodes(run: Run, task: StageProgress) -> None:
+    """Writes `figures/episodes/<style>.gif` and a picture of one moment for every style.
+
+    Of a few games the one with the median return is shown, so that the picture is typical.
+    """
+    env = run.env
+    haland, population = load_haland(run), load_population(run)
+    instructions = run.instructions()
+    folder = run.folder.path / EPISODES
+    folder.mkdir(parents=True, exist_ok=True)
+    key = jax.random.fold_in(jax.random.key(run.config.seed), 2000)
+    play = jax.jit(
+        lambda keys, ego, partner, style: jax.vmap(
+            lambda k: rollout.record(env, k, ego, partner, style)
+        )(keys)
+    )
+    for index, name in enumerate(env.style_names):
+        generate_key, *play_keys = jax.random.split(
+            jax.random.fold_in(key, index), 1 + GAMES_TO_CHOOSE_FROM
+        )
+        sentence = instructions[name].test[0]
+        ego = haland.generate(sentence, generate_key)
+        partner = jax.tree.map(lambda leaf: leaf[index, 0], population.held_out_partners)
+        games = play(jax.numpy.stack(play_keys), ego, partner, env.style(name))
+        returns = np.asarray(games.rewards.sum(axis=1))
+        typical = int(np.argsort(returns)[len(returns) // 2])
+        game = jax.tree.map(lambda leaf: np.asarray(leaf[typical]), games)
+        save_episode(env, folder / f"{name}.gif", game, name, sentence, steps=GIF_STEPS)
+        save_moment(env, folder / f"{name}.png", game, name, sentence, step=GIF_STEPS // 2)
+        task.update(index + 1)
+
+
+def save_episode(
+    env: Any,
+    path: Path,
+    game: Recording,
+    style_name: str,
+    caption: str,
+    *,
+    steps: int | None = None,
+) -> float:
+    """Writes a game as a GIF.
+
+    Args:
+        env: the environment.
+        path: the file.
+        game: what `rollout.record` returned, as NumPy arrays.
+        style_name: the partner's style.
+        caption: shown under the picture, such as the sentence.
+        steps: only the first steps; all by default.
+
+    Returns:
+        The whole game's return.
+    """
+    shown = slice(0, min(steps or len(game.rewards), len(game.rewards)))
+    scores = np.concatenate([[0.0], np.cumsum(game.rewards)])[:-1]
+    viewer.save_gif(
+        path,
+        env.layout,
+        jax.tree.map(lambda leaf: leaf[shown], game.states),
+        style=env.style(style_name),
+        scores=scores[shown],
+        title=style_name.replace("_", " "),
+        caption=caption,
+        max_steps=env.max_steps,
+    )
+    return float(game.rewards.sum())
+
+
+def save_moment(
+    env: Any, path: Path, game: Recording, style_name: str, caption: str, *, step: int
+) -> None:
+    """Writes one moment of a game as a PNG and an SVG beside it; arguments as `save_episode`."""
+    step = min(step, len(game.rewards) - 1)
+    scene = viewer.draw_state(
+        env.layout,
+        jax.tree.map(lambda leaf: leaf[step], game.states),
+        style=env.style(style_name),
+        score=float(game.rewards[:step].sum()),
+        title=style_name.replace("_", " "),
+        caption=caption,
+        max_steps=env.max_steps,
+    )
+    viewer.save_png(path, scene)
+    viewer.save_svg(path.with_suffix(".svg"), scene)

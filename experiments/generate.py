@@ -1,0 +1,86 @@
+"""One sentence, one policy, one episode.
+
+python -m experiments.generate RUN "I stay on the left and never touch the onions"
+python -m experiments.generate RUN "…" --gif episode.gif
+"""
+
+import dataclasses
+import time
+from pathlib import Path
+from typing import Annotated, Literal
+
+import jax
+import numpy as np
+import tyro
+from rich.console import Console
+from rich.table import Table
+
+from experiments import devices
+from experiments.errors import UserError, as_user_error, choose, main_guard
+
+
+@dataclasses.dataclass(frozen=True)
+class Arguments:
+    """Make an agent from one sentence and play an episode with a held-out partner."""
+
+    run: tyro.conf.Positional[Path]
+    """Folder of a finished run."""
+    sentence: tyro.conf.Positional[str]
+    """How the partner likes to work, in plain words (at most 32 word pieces)."""
+    style: Annotated[str | None, tyro.conf.arg(metavar="NAME")] = None
+    """Style of the partner to play with; by default the one that the sentence sounds like."""
+    gif: Annotated[Path | None, tyro.conf.arg(metavar="FILE")] = None
+    """Write the episode as an animated picture."""
+    seed: int = 0
+    """Another seed gives another sample of the policy and another episode."""
+    sampler: Literal["ddim", "ddpm"] = "ddim"
+    """ddim is fast; ddpm takes all steps of Eq. 1."""
+
+
+@main_guard
+def main() -> None:
+    """The command."""
+    arguments = tyro.cli(Arguments, prog="python -m experiments.generate")
+    devices.prepare(cores=1)
+    from experiments.finished_run import open_run
+    from experiments.gallery import save_episode
+    from experiments.stages import load_haland, load_population
+    from haland_jax import rollout
+
+    if arguments.gif is not None and not arguments.gif.absolute().parent.is_dir():
+        raise UserError(f"the folder of {arguments.gif} does not exist; make it first")
+    run = open_run(arguments.run)
+    if arguments.style is not None:
+        choose("style", arguments.style, run.env.style_names)
+    haland, population = load_haland(run), load_population(run)
+    generate_key, play_key = jax.random.split(jax.random.key(arguments.seed))
+    with as_user_error():
+        made = haland.explain(arguments.sentence, generate_key, sampler=arguments.sampler)
+    jax.block_until_ready(made.policy)
+    start = time.perf_counter()
+    made = haland.explain(arguments.sentence, generate_key, sampler=arguments.sampler)
+    jax.block_until_ready(made.policy)
+    milliseconds = 1000 * (time.perf_counter() - start)
+    sounds_like = run.env.style_names[int(haland.nearest_style(made.v_hat))]
+    style = arguments.style or sounds_like
+    index = run.env.style_names.index(style)
+    partner = jax.tree.map(lambda leaf: leaf[index, 0], population.held_out_partners)
+    play = jax.jit(
+        lambda key: rollout.record(run.env, key, made.policy, partner, run.env.style(style))
+    )
+    game = jax.tree.map(np.asarray, play(play_key))
+
+    table = Table(show_header=False, box=None)
+    table.add_row("sentence", arguments.sentence)
+    table.add_row("sounds like", sounds_like)
+    table.add_row("policy made in", f"{milliseconds:.0f} ms (warm, {arguments.sampler})")
+    table.add_row("partner", f"held-out, style {style}")
+    table.add_row("return", f"{game.rewards.sum():.0f} in {run.env.max_steps} steps")
+    if arguments.gif is not None:
+        save_episode(run.env, arguments.gif, game, style, arguments.sentence)
+        table.add_row("episode", str(arguments.gif))
+    Console().print(table)
+
+
+if __name__ == "__main__":
+    main()
