@@ -1,4 +1,4 @@
-"""Prepares JAX for a command: one device for each core of a CPU, and a lasting compilation cache."""
+"""Prepares JAX for a command: a device for each core, and a lasting compilation cache."""
 
 import os
 from pathlib import Path

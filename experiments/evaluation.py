@@ -46,9 +46,8 @@ class Judge:
         means = []
         for first in range(0, total, self.batch):
             rows = np.minimum(np.arange(first, first + self.batch), total - 1)
-            played = self._play(
-                keys[rows], *jax.tree.map(lambda leaf: leaf[rows], (egos, partner, styles))
-            )
+            pairs = _rows((egos, partner, styles), rows)
+            played = self._play(keys[rows], *pairs)
             means.append(np.asarray(played.returns.mean(axis=1)))
         return np.concatenate(means)[:total]
 
@@ -189,6 +188,10 @@ def nearest_is_right(haland: Haland, v_hat: jax.Array) -> np.ndarray:
     """Whether each translation is nearest to its own style's task language, [style, sentence]."""
     found = np.asarray(haland.nearest_style(v_hat))
     return found == np.arange(len(found))[:, None]
+
+
+def _rows(tree: Any, rows: np.ndarray) -> Any:
+    return jax.tree.map(lambda leaf: leaf[rows], tree)
 
 
 def _generate(haland: Haland, key: jax.Array, v_hat: jax.Array, styles: int) -> tuple[Policy, Any]:

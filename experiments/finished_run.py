@@ -6,7 +6,6 @@ from typing import Any
 
 from experiments.configs import PRESETS, RunConfig
 from experiments.errors import UserError
-from experiments.progress import RunProgress
 from experiments.run_folder import RunFolder, to_json
 from experiments.stages import STAGES, Run
 
@@ -21,7 +20,7 @@ def open_run(path: Path) -> Run:
         UserError: there is no finished run, or it was made by another version's preset.
     """
     folder = RunFolder.read(path, tuple(STAGES))
-    return Run(_configuration(path, folder.configuration), folder, RunProgress(()))
+    return Run(_configuration(path, folder.configuration), folder)
 
 
 def _configuration(path: Path, stored: dict[str, Any]) -> RunConfig:

@@ -1,4 +1,4 @@
-"""Pictures of play: one episode a style, generated from a test sentence, with a held-out partner."""
+"""Pictures of play: an episode of a generated ego and a held-out partner for each style."""
 
 from pathlib import Path
 from typing import Any
@@ -39,14 +39,18 @@ def record_episodes(run: Run, task: StageProgress) -> None:
         )
         sentence = instructions[name].test[0]
         ego = haland.generate(sentence, generate_key)
-        partner = jax.tree.map(lambda leaf: leaf[index, 0], population.held_out_partners)
+        partner = _at(population.held_out_partners, (index, 0))
         games = play(jax.numpy.stack(play_keys), ego, partner, env.style(name))
         returns = np.asarray(games.rewards.sum(axis=1))
         typical = int(np.argsort(returns)[len(returns) // 2])
-        game = jax.tree.map(lambda leaf: np.asarray(leaf[typical]), games)
+        game = jax.tree.map(np.asarray, _at(games, typical))
         save_episode(env, folder / f"{name}.gif", game, name, sentence, steps=GIF_STEPS)
         save_moment(env, folder / f"{name}.png", game, name, sentence, step=GIF_STEPS // 2)
         task.update(index + 1)
+
+
+def _at(tree: Any, index: Any) -> Any:
+    return jax.tree.map(lambda leaf: leaf[index], tree)
 
 
 def save_episode(

@@ -1,4 +1,4 @@
-"""The stages in order. Each reads artefacts and writes artefacts; a finished one is not run again."""
+"""The stages in order; each reads and writes artefacts, and a finished one is not run again."""
 
 import os
 import platform
@@ -33,7 +33,7 @@ def run_pipeline(config: RunConfig, path: Path) -> dict[str, Any]:
     """
     names = (*STAGES, EVALUATION, REPORT)
     with RunFolder.write(path, config) as folder, RunProgress(names, folder) as progress:
-        run = Run(config, folder, progress)
+        run = Run(config, folder)
         totals = _totals(config)
         for name, stage in STAGES.items():
             if folder.stage_done(name):

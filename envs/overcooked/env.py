@@ -35,7 +35,7 @@ class Overcooked:
     encoding: Literal["features", "grid"] = "features"
     shaping: Literal["guided", "reference"] = "guided"
     random_start: float = 0.9
-    weights: ShapingWeights = ShapingWeights()
+    weights: ShapingWeights = dataclasses.field(default_factory=ShapingWeights)
 
     def __post_init__(self):
         for name, options in (

@@ -142,8 +142,8 @@ REFERENCE_EVENTS = (
 def reference_events(layout: Layout, transition: Transition) -> dict[str, jax.Array]:
     """Returns overcooked-ai's event log of this step, each bool [agent].
 
-    The reference's quirk is kept: taking a tomato from a dispenser logs nothing. Source: `log_object_pickup`, `log_object_drop` and
-    `log_object_potting` of overcooked-ai 1.1.0.
+    The reference's quirk is kept: taking a tomato from a dispenser logs nothing. Source:
+    `log_object_pickup`, `log_object_drop` and `log_object_potting` of overcooked-ai 1.1.0.
     """
     did = transition.interactions
     pots = transition.before

@@ -1,23 +1,16 @@
-"""The stages of a run: each reads what earlier ones made and writes what later ones need.
+"""Policy VAE, latent diffusion and translator: what turns a sentence into a policy."""
 
-A stage is a function of a `Run`; it restores its own result if that is already there.
-"""
-
-import dataclasses
 from functools import partial
 from typing import Any
 
 import jax
 import jax.numpy as jnp
 import numpy as np
-from flax.struct import PyTreeNode
 
-import envs
-from envs.instructions import Instructions, load_instructions
-from experiments.configs import RunConfig
-from experiments.progress import RunProgress, StageProgress
-from experiments.run_folder import RunFolder
-from experiments.training import Saver, run_fit, train_population
+from experiments.progress import StageProgress
+from experiments.stages.context import Run
+from experiments.stages.population import load_archive, load_population, load_task_language
+from experiments.training import Saver, run_fit
 from haland_jax import (
     bert_weights,
     checkpoint,
@@ -25,222 +18,22 @@ from haland_jax import (
     fit,
     partners,
     policy_vae,
-    task_language,
     translator,
 )
 from haland_jax.deployment import Haland
 from haland_jax.diffusion import DiffusionParams, LatentArchive
 from haland_jax.hypernetwork import PolicyArchitecture
 from haland_jax.networks import Policy
-from haland_jax.partners import Player, Population
+from haland_jax.partners import Population
 from haland_jax.policy_vae import PolicyVAE
 from haland_jax.population import over_population
-from haland_jax.task_language import TaskLanguage
 
-CURVE_POINTS = 40
 VISIT_GAMES = 4
-
-
-@dataclasses.dataclass
-class Run:
-    """What every stage is given."""
-
-    config: RunConfig
-    folder: RunFolder
-    progress: RunProgress
-
-    def __post_init__(self):
-        self.env: Any = envs.make(self.config.environment, max_steps=self.config.max_steps)
-
-    def key(self, stage: str) -> jax.Array:
-        """The stage's own key: the same whichever stages ran before in this process."""
-        root = jax.random.key(self.config.seed)
-        return jax.random.fold_in(root, list(STAGES).index(stage))
-
-    def instructions(self) -> dict[str, Instructions]:
-        """The packaged sentences, in the order of the styles."""
-        return load_instructions(self.config.environment, self.env.style_names)
-
-    def path(self, stage: str, name: str):
-        """Where a checkpoint of a stage lies."""
-        return self.folder.stage_path(stage) / name
-
-
-class Archive(PyTreeNode):
-    """Best responses and the Oracles.
-
-    Attributes:
-        egos: refitted egos, leading axes [style, train_seeds].
-        oracles: the best ego for each held-out partner, actors [style, held_out_seeds].
-        oracle_returns: their mean return in selection games, [style, held_out_seeds, candidate].
-    """
-
-    egos: Player
-    oracles: Policy
-    oracle_returns: jax.Array
-
-
-def make_partners(run: Run, task: StageProgress) -> dict[str, Any]:
-    """Stage 1a: trains pairs of every style and seed together and keeps the best."""
-    config, env = run.config.partners, run.env
-    train_key, play_key = jax.random.split(run.key("partners"))
-    state, rewards = train_population(
-        env,
-        config.joint,
-        lambda: partners.init_pairs(env, config, train_key),
-        partners.repeat_styles(env, config.num_seeds),
-        Saver(run.path("partners", "unfinished")),
-        task.update,
-        "partners",
-    )
-    returns = _mean_returns(run, play_key, state.ego.actor, state.partner.actor, config.num_seeds)
-    population = partners.make_population(env, config, state, returns)
-    checkpoint.save(run.path("partners", "population"), population)
-    points = np.linspace(0, len(rewards), min(CURVE_POINTS, len(rewards)) + 1).astype(int)
-    smooth = [rewards[a:b].mean(0) for a, b in zip(points[:-1], points[1:], strict=True)]
-    by_style = np.array(smooth).reshape(len(smooth), len(env.style_names), -1) * env.max_steps
-    return {
-        "joint_returns": dict(zip(env.style_names, returns.tolist(), strict=True)),
-        "kept_for_training": np.asarray(population.train_index),
-        "kept_held_out": np.asarray(population.held_out_index),
-        "curve_steps": points[1:] * config.joint.steps_per_update,
-        "curve_returns": {name: by_style[:, index].T for index, name in enumerate(env.style_names)},
-    }
-
-
-def load_population(run: Run) -> Population:
-    """The partners that `make_partners` kept."""
-    config, env = run.config.partners, run.env
-    shapes = jax.eval_shape(lambda key: partners.init_pairs(env, config, key), jax.random.key(0))
-
-    def seeds(tree: Any, count: int) -> Any:
-        return jax.tree.map(
-            lambda leaf: jax.ShapeDtypeStruct(
-                (len(env.style_names), count, *leaf.shape[1:]), leaf.dtype
-            ),
-            tree,
-        )
-
-    egos = Player(shapes.ego.actor, shapes.ego.critic)
-    train, held_out = config.train_seeds, config.held_out_seeds
-    styles = len(env.style_names)
-    like = Population(
-        train_partners=seeds(shapes.partner.actor, train),
-        held_out_partners=seeds(shapes.partner.actor, held_out),
-        train_egos=seeds(egos, train),
-        held_out_egos=seeds(egos, held_out),
-        joint_returns=jax.ShapeDtypeStruct((styles, config.num_seeds), jnp.float32),
-        train_index=jax.ShapeDtypeStruct((styles, train), jnp.int32),
-        held_out_index=jax.ShapeDtypeStruct((styles, held_out), jnp.int32),
-    )
-    return checkpoint.restore(run.path("partners", "population"), like)
-
-
-def make_best_responses(run: Run, task: StageProgress) -> dict[str, Any]:
-    """Stage 1b: refits the egos, which become the archive, and finds the Oracles."""
-    config, env = run.config.partners, run.env
-    population = load_population(run)
-    refit_key, oracle_key, play_key = jax.random.split(run.key("best_responses"), 3)
-    refitted, _ = train_population(
-        env,
-        config.refit,
-        lambda: partners.best_response_refits(env, config, refit_key, population),
-        partners.repeat_styles(env, config.train_seeds),
-        Saver(run.path("best_responses", "unfinished_refits")),
-        task.update,
-        "best responses",
-    )
-    num_styles = len(env.style_names)
-    egos = partners.unflatten(Player(refitted.ego.actor, refitted.ego.critic), num_styles)
-    candidates = config.held_out_seeds * config.oracle_candidates
-    offset = config.refit.num_updates
-    trained, _ = train_population(
-        env,
-        config.oracle,
-        lambda: partners.oracle_refits(env, config, oracle_key, population, egos),
-        partners.repeat_styles(env, candidates),
-        Saver(run.path("best_responses", "unfinished_oracles")),
-        lambda done, metrics: task.update(offset + done, metrics),
-        "oracles",
-    )
-    repeated = jax.tree.map(
-        lambda leaf: jnp.repeat(leaf, config.oracle_candidates, axis=1),
-        population.held_out_partners,
-    )
-    returns = _mean_returns(
-        run, play_key, trained.ego.actor, partners.flatten(repeated), candidates
-    ).reshape(num_styles, config.held_out_seeds, config.oracle_candidates)
-    best = returns.argmax(axis=2)
-    actors = jax.tree.map(
-        lambda leaf: leaf.reshape(*returns.shape, *leaf.shape[1:]), trained.ego.actor
-    )
-    rows, columns = np.indices(best.shape)
-    archive = Archive(
-        egos=egos,
-        oracles=jax.tree.map(lambda leaf: leaf[rows, columns, best], actors),
-        oracle_returns=jnp.asarray(returns, jnp.float32),
-    )
-    checkpoint.save(run.path("best_responses", "archive"), archive)
-    return {"oracle_candidate_returns": returns}
-
-
-def load_archive(run: Run) -> Archive:
-    """The best responses and Oracles that `make_best_responses` kept."""
-    config = run.config.partners
-    population = load_population(run)
-    shape = (len(run.env.style_names), config.held_out_seeds, config.oracle_candidates)
-    like = Archive(
-        egos=population.train_egos,
-        oracles=population.held_out_egos.actor,
-        oracle_returns=jnp.zeros(shape),
-    )
-    return checkpoint.restore(run.path("best_responses", "archive"), like)
-
-
-def make_task_language(run: Run, task: StageProgress) -> dict[str, Any]:
-    """Stage 2: counts events in games of the best responses with their training partners."""
-    env, games = run.env, run.config.task_language_games
-    population, archive = load_population(run), load_archive(run)
-    times = run.config.partners.train_seeds
-    play = partners.compile_evaluation(env, games)
-    keys = jax.random.split(run.key("task_language"), len(env.style_names) * times)
-    played = play(
-        keys,
-        partners.flatten(archive.egos.actor),
-        partners.flatten(population.train_partners),
-        partners.repeat_styles(env, times),
-    )
-    task.update(1)
-    counts = partners.unflatten(played.events, len(env.style_names))
-    lengths = partners.unflatten(played.lengths, len(env.style_names))
-    names = task_language.agent_event_names(env.event_names, envs.AGENTS)
-    language = task_language.build_task_language(
-        task_language.event_frequencies(counts, np.asarray(lengths)), names
-    )
-    checkpoint.save(
-        run.path("task_language", "language"),
-        {"v_hat": language.v_hat, "by_seed": language.v_hat_by_seed, "scale": language.scale},
-        {"events": list(language.event_names), "dropped": list(language.dropped_event_names)},
-    )
-    return {"events": len(language.event_names), "dropped": len(language.dropped_event_names)}
-
-
-def load_task_language(run: Run) -> TaskLanguage:
-    """What `make_task_language` counted."""
-    path = run.path("task_language", "language")
-    arrays, names = checkpoint.restore(path), checkpoint.read_metadata(path)
-    return TaskLanguage(
-        v_hat=jnp.asarray(arrays["v_hat"]),
-        v_hat_by_seed=jnp.asarray(arrays["by_seed"]),
-        scale=jnp.asarray(arrays["scale"]),
-        event_names=tuple(names["events"]),
-        dropped_event_names=tuple(names["dropped"]),
-    )
 
 
 def fit_policy_vae(run: Run, task: StageProgress) -> dict[str, Any]:
     """Stage 3: compresses the archive; states of decoded policies join as the fit goes on."""
-    config, env = run.config.compression, run.env
+    config = run.config.compression
     population, archive = load_population(run), load_archive(run)
     policies = partners.flatten(archive.egos.actor)
     init_key, fit_key, state_key = jax.random.split(run.key("policy_vae"), 3)
@@ -387,7 +180,7 @@ def fit_translator(run: Run, task: StageProgress) -> dict[str, Any]:
     ids, mask = bert_weights.tokenize(tokenizer, sentences, config.maximum_length)
     prepared = translator.prepare_sentences(encoder, config, ids, mask, np.array(labels))
     keys = jax.random.split(run.key("translator"), 5)
-    tuned, first = _two_saves(
+    tuned, first = _fit_part(
         run,
         task,
         "fine-tuning",
@@ -401,7 +194,7 @@ def fit_translator(run: Run, task: StageProgress) -> dict[str, Any]:
     data = translator.prepare_translation(
         keys[2], tuned, encoder.architecture, config, prepared, language.v_hat
     )
-    vae, second = _two_saves(
+    vae, second = _fit_part(
         run,
         task,
         "translation",
@@ -418,7 +211,7 @@ def fit_translator(run: Run, task: StageProgress) -> dict[str, Any]:
     return {**{f"fine_tuning_{k}": v for k, v in first.items()}, **second}
 
 
-def _two_saves(run, task, name, config, functions, params, key, data, *, offset):
+def _fit_part(run, task, name, config, functions, params, key, data, *, offset):
     """One of the translator's two fits."""
     loss_fn, sample_fn = functions
     chunk = fit.make_fit_chunk(loss_fn, sample_fn, config, max(1, config.steps // 10))
@@ -462,24 +255,3 @@ def load_haland(run: Run) -> Haland:
         style_names=run.env.style_names,
         v_hat=language.v_hat,
     )
-
-
-def _mean_returns(
-    run: Run, key: jax.Array, egos: Policy, partner_policies: Policy, seeds: int
-) -> np.ndarray:
-    """Mean return of each pair [style * seeds], as [style, seeds]."""
-    env = run.env
-    play = partners.compile_evaluation(env, run.config.partners.evaluation_games)
-    keys = jax.random.split(key, len(env.style_names) * seeds)
-    games = play(keys, egos, partner_policies, partners.repeat_styles(env, seeds))
-    return np.asarray(games.returns.mean(axis=1)).reshape(len(env.style_names), seeds)
-
-
-STAGES = {
-    "partners": make_partners,
-    "best_responses": make_best_responses,
-    "task_language": make_task_language,
-    "policy_vae": fit_policy_vae,
-    "diffusion": fit_diffusion,
-    "translator": fit_translator,
-}

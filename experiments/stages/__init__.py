@@ -1,0 +1,30 @@
+"""The stages of a run: each reads what earlier ones made and writes what later ones need.
+
+A stage is a function of a `Run` and its progress; it saves its result as a checkpoint, which
+the matching `load_…` restores, and returns metrics.
+"""
+
+from experiments.stages.context import STAGE_NAMES as STAGE_NAMES
+from experiments.stages.context import Run as Run
+from experiments.stages.model import fit_diffusion, fit_policy_vae, fit_translator
+from experiments.stages.model import load_haland as load_haland
+from experiments.stages.model import load_vae as load_vae
+from experiments.stages.population import load_archive as load_archive
+from experiments.stages.population import load_population as load_population
+from experiments.stages.population import load_task_language as load_task_language
+from experiments.stages.population import make_best_responses, make_partners, make_task_language
+
+STAGES = dict(
+    zip(
+        STAGE_NAMES,
+        (
+            make_partners,
+            make_best_responses,
+            make_task_language,
+            fit_policy_vae,
+            fit_diffusion,
+            fit_translator,
+        ),
+        strict=True,
+    )
+)
