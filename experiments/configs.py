@@ -100,6 +100,7 @@ def _refit(total_steps: int) -> PPOConfig:
         final_entropy=0.002,
         shaping=0.0,
         confined_until=0.0,
+        random_start=0.3,
     )
 
 

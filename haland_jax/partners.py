@@ -50,12 +50,22 @@ class PartnersConfig:
     joint: PPOConfig = dataclasses.field(default_factory=PPOConfig)
     refit: PPOConfig = dataclasses.field(
         default_factory=lambda: PPOConfig(
-            total_steps=300_000, learning_rate=3e-4, entropy=0.01, shaping=0.0, confined_until=0.0
+            total_steps=300_000,
+            learning_rate=3e-4,
+            entropy=0.01,
+            shaping=0.0,
+            confined_until=0.0,
+            random_start=0.3,
         )
     )
     oracle: PPOConfig = dataclasses.field(
         default_factory=lambda: PPOConfig(
-            total_steps=300_000, learning_rate=3e-4, entropy=0.01, shaping=0.0, confined_until=0.0
+            total_steps=300_000,
+            learning_rate=3e-4,
+            entropy=0.01,
+            shaping=0.0,
+            confined_until=0.0,
+            random_start=0.3,
         )
     )
     oracle_candidates: int = 3

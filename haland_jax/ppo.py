@@ -87,7 +87,9 @@ def init_train_state(
     """Starts the games of one pair; `key` is consumed here and by the training."""
     reset_key, train_key = jax.random.split(key)
     keys = jax.random.split(reset_key, config.num_envs)
-    states, timesteps = jax.vmap(env.training_reset, in_axes=(0, None))(keys, style)
+    states, timesteps = jax.vmap(env.training_reset, in_axes=(0, None, None))(
+        keys, style, config.random_start
+    )
     return TrainState(
         update=jnp.zeros((), jnp.int32),
         key=train_key,
@@ -130,7 +132,8 @@ def _update(
     confined = env.confine(style)
     bound = progress < config.confined_until
     style_now = jax.tree.map(lambda held, free: jnp.where(bound, held, free), confined, style)
-    state, steps = _rollout(env, config, state, style_now, rollout_key)
+    random_share = _falling(config.random_start, config.final_random_start, progress)
+    state, steps = _rollout(env, config, state, style_now, rollout_key, random_share)
 
     actors, critic = make_networks(env)
     shaping = config.shaping * jnp.maximum(0.0, 1 - progress / config.shaping_until)
@@ -166,7 +169,12 @@ def _falling(start: float, end: float, progress: jax.Array) -> jax.Array:
 
 
 def _rollout(
-    env: Environment, config: PPOConfig, state: TrainState, style: Any, key: jax.Array
+    env: Environment,
+    config: PPOConfig,
+    state: TrainState,
+    style: Any,
+    key: jax.Array,
+    random_share: jax.Array,
 ) -> tuple[TrainState, dict[str, Any]]:
     """Plays `rollout_steps` steps of all games; finished games start anew."""
     actors, _ = make_networks(env)
@@ -190,7 +198,9 @@ def _rollout(
             keys, states, actions, style
         )
         keys = jax.random.split(reset_key, config.num_envs)
-        fresh, first = jax.vmap(env.training_reset, in_axes=(0, None))(keys, style)
+        fresh, first = jax.vmap(env.training_reset, in_axes=(0, None, None))(
+            keys, style, random_share
+        )
         done = timesteps.done
 
         def restart(new, old):

@@ -34,6 +34,9 @@ class PPOConfig:
         shaping: factor on the shaped reward at the start, falling linearly to 0.
         shaping_until: progress, 0 to 1, at which the shaped reward has gone.
         confined_until: progress up to which the ego is held to its role.
+        random_start: share of games that start at a random moment, at the start of training;
+            it falls linearly to `final_random_start`.
+        final_random_start: the same at the end of training.
     """
 
     total_steps: int = 1_000_000
@@ -54,6 +57,8 @@ class PPOConfig:
     shaping: float = 3.0
     shaping_until: float = 0.85
     confined_until: float = 0.55
+    random_start: float = 0.9
+    final_random_start: float = 0.0
 
     def __post_init__(self):
         if self.num_envs % self.num_minibatches:

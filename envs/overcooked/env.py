@@ -26,7 +26,6 @@ class Overcooked:
             by itself, and only so.
         encoding: `features`, a flat vector, or `grid`, overcooked-ai's lossless encoding.
         shaping: `guided`, ours, or `reference`, overcooked-ai's.
-        random_start: share of training games that start at a random moment, 0 to 1.
     """
 
     layout: Layout
@@ -34,7 +33,6 @@ class Overcooked:
     dynamics: Literal["new", "old"] = "new"
     encoding: Literal["features", "grid"] = "features"
     shaping: Literal["guided", "reference"] = "guided"
-    random_start: float = 0.9
     weights: ShapingWeights = dataclasses.field(default_factory=ShapingWeights)
 
     def __post_init__(self):
@@ -46,8 +44,6 @@ class Overcooked:
             value = getattr(self, name)
             if value not in options:
                 raise ValueError(f"{name} is {value!r}; expected one of {', '.join(options)}")
-        if not 0 <= self.random_start <= 1:
-            raise ValueError(f"random_start is {self.random_start}; expected a share, 0 to 1")
         if self.max_steps <= 50:
             raise ValueError(f"max_steps is {self.max_steps}; expected more than 50")
 
@@ -65,12 +61,7 @@ class Overcooked:
     def styles(self) -> Style:
         """All styles stacked, leading axis [style]."""
         rules = styles.style_rules(self.layout).values()
-        built = [
-            styles.build_style(
-                self.layout, rule, max_steps=self.max_steps, random_share=self.random_start
-            )
-            for rule in rules
-        ]
+        built = [styles.build_style(self.layout, rule, max_steps=self.max_steps) for rule in rules]
         return jax.tree.map(lambda *leaves: jnp.stack(leaves), *built)
 
     def style(self, name: str) -> Style:
@@ -120,9 +111,19 @@ class Overcooked:
         state = dynamics.start_state(self.layout, style.start)
         return state, self._first(state, style)
 
-    def training_reset(self, key: jax.Array, style: Style) -> tuple[State, TimeStep]:
-        """Starts a game at a moment drawn from the style's pool; consumes `key`."""
-        index = jax.random.randint(key, (), 0, styles.POOL_SIZE)
+    def training_reset(
+        self, key: jax.Array, style: Style, random_share: jax.Array | float
+    ) -> tuple[State, TimeStep]:
+        """Starts a game, or goes on from a random moment of one.
+
+        Args:
+            key: consumed.
+            style: the partner's style.
+            random_share: chance of a moment drawn from the style's pool, 0 to 1.
+        """
+        # Element 0 of the pool is the usual start; one draw decides whether and where.
+        drawn = jax.random.uniform(key) / jnp.maximum(random_share, 1e-6)
+        index = jnp.where(drawn < 1, 1 + (drawn * (styles.POOL_SIZE - 1)).astype(jnp.int32), 0)
         state = jax.tree.map(lambda leaf: leaf[index], style.pool)
         return state, self._first(state, style)
 

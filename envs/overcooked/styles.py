@@ -36,7 +36,8 @@ class Style(PyTreeNode):
             where every style serves the same order.
         hand_over: what each player earns by putting an item kind on a counter, float32
             [agent, C, 4]; training only.
-        pool: moments of games to start from in training, `State` with leading axis [pool].
+        pool: moments of games to start from in training, `State` with leading axis [pool];
+            the first is the usual start.
     """
 
     cells: jax.Array
@@ -183,14 +184,13 @@ def style_rules(layout: Layout) -> dict[str, Rule]:
     return RULES[layout.name]() if layout.name in RULES else {FREE_STYLE: Rule()}
 
 
-def build_style(layout: Layout, rule: Rule, *, max_steps: int, random_share: float) -> Style:
+def build_style(layout: Layout, rule: Rule, *, max_steps: int) -> Style:
     """Turns a rule into arrays.
 
     Args:
         layout: the kitchen.
         rule: the style.
         max_steps: length of a game.
-        random_share: share of the start pool that is a random moment of a game, 0 to 1.
     """
     floor = [(int(x), int(y)) for x, y in layout.floor]
     stations = [
@@ -213,7 +213,7 @@ def build_style(layout: Layout, rule: Rule, *, max_steps: int, random_share: flo
         pays = np.where(np.arange(len(stations))[:, None] == paying, ordered, 0.0)
         task = np.zeros(2 + len(serving), np.float32)
         task[[0 if content == 12 else 1, 1 + number]] = 1
-    pool = _start_pool(layout, start, role_cells, partner_cells, max_steps, random_share)
+    pool = _start_pool(layout, start, role_cells, partner_cells, max_steps)
     style = Style(
         cells=np.stack([np.ones_like(partner_cells), partner_cells]),
         targets=np.stack([np.ones_like(partner_targets), partner_targets]),
@@ -292,18 +292,14 @@ def _start_pool(
     ego_cells: np.ndarray,
     partner_cells: np.ndarray,
     max_steps: int,
-    random_share: float,
 ) -> State:
     """Draws moments to start from; computed once, since drawing on every reset is slow."""
     random = np.random.default_rng(0)
-    moments = []
-    for index in range(POOL_SIZE):
-        if index >= random_share * POOL_SIZE:
-            moments.append(jax.tree.map(np.asarray, dynamics.start_state(layout, start)))
-        else:
-            moments.append(
-                _random_moment(layout, random, start, ego_cells, partner_cells, max_steps)
-            )
+    moments = [jax.tree.map(np.asarray, dynamics.start_state(layout, start))]
+    moments += [
+        _random_moment(layout, random, start, ego_cells, partner_cells, max_steps)
+        for _ in range(POOL_SIZE - 1)
+    ]
     return jax.tree.map(lambda *leaves: np.stack(leaves), *moments)
 
 
