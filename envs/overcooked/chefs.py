@@ -30,6 +30,13 @@ EGO = ChefColours(main="#2a62c8", dark="#173f8a", light="#c9dcfb", hair="#4a2f1d
 PARTNER = ChefColours(main="#35b57c", dark="#147a4d", light="#d5f5e4", hair="#1f1b1a")
 _SKIN, _SKIN_EDGE, _CHEEK = "#f7d3ae", "#c98f5f", "#f0a58a"
 _HEAD_X, _HEAD_Y = 32.0, 29.0
+_ITEM_PLACE = {NORTH: (32, 12.5), SOUTH: (32, 50), EAST: (52, 47), WEST: (12, 47)}
+_SLEEVES_AND_HANDS = {
+    NORTH: (((19, 44), (17.5, 16)), ((45, 44), (46.5, 16))),
+    SOUTH: (((20, 43), (22.5, 52)), ((44, 43), (41.5, 52))),
+    EAST: (((34, 44), (44, 50)), ((36, 46), (46, 52))),
+    WEST: (((30, 44), (20, 50)), ((28, 46), (18, 52))),
+}
 
 
 @functools.cache
@@ -45,11 +52,13 @@ def chef_shapes(agent: int, orientation: int, held: int) -> tuple[Shape, ...]:
     shadow = Ellipse(32, 58.5, 17, 4, "#000000", opacity=0.16)
     torso = _torso(colours, orientation)
     head = (*_head(colours, orientation), *_hat(agent, colours))
-    front = _hands_and_item(colours, orientation, held)
+    arms, hands = _arms(colours, orientation, held != 0)
+    x, y = _ITEM_PLACE[orientation]
+    item = place(item_shapes(held), x, y, 0.85)
     if orientation == NORTH:
-        # What it holds is beyond it: the head goes in front of the arms, the item above the hat.
-        return (shadow, *torso, *head, *front)
-    return (shadow, *torso, *head, *front)
+        # The arms reach away from us, and the head bows below what they lift.
+        return (shadow, *torso, *arms, *place(head, 0, 5 if held else 0), *item, *hands)
+    return (shadow, *torso, *head, *arms, *item, *hands)
 
 
 def _torso(colours: ChefColours, orientation: int) -> tuple[Shape, ...]:
@@ -91,9 +100,9 @@ def _head(colours: ChefColours, orientation: int) -> tuple[Shape, ...]:
         face,
         Ellipse(x - side * 8.3, y + 0.5, 4.6, 9, colours.hair),
         circle(x - side * 3.2, y + 1.5, 2.8, _SKIN, _SKIN_EDGE, 1.2),
-        circle(x + side * 13.2, y + 2, 2.7, _SKIN, _SKIN_EDGE, 1.2),
+        circle(x + side * 13, y + 1.4, 2.7, _SKIN, _SKIN_EDGE, 1.2),
         Ellipse(x + side * 6.6, y - 0.8, 1.9, 2.5, INK),
-        circle(x + side * 4.6, y + 5, 2.1, _CHEEK, opacity=0.75),
+        circle(x + side * 2.6, y + 6, 2.1, _CHEEK, opacity=0.75),
         Line(
             ((x + side * 6.5, y + 7), (x + side * 8.5, y + 7.6), (x + side * 10, y + 6.4)), INK, 1.5
         ),
@@ -116,17 +125,13 @@ def _hat(agent: int, colours: ChefColours) -> tuple[Shape, ...]:
     return (stalk, beret, band)
 
 
-def _hands_and_item(colours: ChefColours, orientation: int, held: int) -> tuple[Shape, ...]:
-    hand_places, sleeves, item_place = {
-        NORTH: (((19, 17), (45, 17)), ((20.5, 43), (43.5, 43)), (32, 10)),
-        SOUTH: (((22.5, 52), (41.5, 52)), ((20, 43), (44, 43)), (32, 50)),
-        EAST: (((44, 50), (46, 52)), ((34, 44), (36, 46)), (52, 47)),
-        WEST: (((20, 50), (18, 52)), ((30, 44), (28, 46)), (12, 47)),
-    }[orientation]
-    arms = tuple(
-        Line((sleeve, hand), colours.dark, 6.5)
-        for sleeve, hand in zip(sleeves, hand_places, strict=True)
-    )
-    hands = tuple(circle(x, y, 3.8, _SKIN, _SKIN_EDGE, 1.2) for x, y in hand_places)
-    item = place(item_shapes(held), *item_place, 0.9)
-    return (*arms, *item, *hands)
+def _arms(
+    colours: ChefColours, orientation: int, holding: bool
+) -> tuple[tuple[Shape, ...], tuple[Shape, ...]]:
+    if orientation == NORTH and not holding:
+        ends = (((20, 42), (15.5, 36.5)), ((44, 42), (48.5, 36.5)))
+    else:
+        ends = _SLEEVES_AND_HANDS[orientation]
+    arms = tuple(Line(end, colours.dark, 6.5) for end in ends)
+    hands = tuple(circle(x, y, 3.8, _SKIN, _SKIN_EDGE, 1.2) for _, (x, y) in ends)
+    return arms, hands

@@ -4,8 +4,8 @@ A picture is a `Scene` of non-overlapping rectangular `Panel`s, each holding sha
 coordinates. Both back ends read the same shapes, so that the two can not drift apart. Equal panels
 are rendered once: that makes the frames of an episode cheap.
 
-Lengths are in scene units (one unit is one pixel at scale 1), x to the right, y downwards, angles in
-degrees clockwise from twelve o'clock, colours "#rrggbb", opacities in [0, 1].
+Lengths are in scene units (one unit is one pixel at scale 1), x to the right, y downwards, angles
+in degrees clockwise from twelve o'clock, colours "#rrggbb", opacities in [0, 1].
 """
 
 from __future__ import annotations
@@ -23,7 +23,7 @@ from PIL import Image, ImageColor, ImageDraw, ImageFont
 SUPERSAMPLING = 4
 # The outline that stands for bold type, as a fraction of the type's size; the bundled font has one
 # weight only.
-_BOLD_STROKE = 0.035
+_BOLD_STROKE = 0.025
 
 
 @dataclass(frozen=True)

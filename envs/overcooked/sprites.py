@@ -1,8 +1,8 @@
-"""What is seen in an Overcooked kitchen, drawn as shapes: tiles, items and pots (for chefs: `chefs`).
+"""What is seen in an Overcooked kitchen but for its chefs, drawn as shapes: tiles, items, pots.
 
 A tile is `TILE` x `TILE` units with its origin at the top left. Items are drawn around (0, 0) and
-are some 20 units wide; `place` moves and scales them. Onions and tomatoes differ in outline as well as in
-colour.
+are some 20 units wide; `place` moves and scales them. Onions and tomatoes differ in outline as well
+as in colour.
 """
 
 from __future__ import annotations
@@ -207,7 +207,8 @@ def pot_shapes(content: int, timer: int, cook_time: int) -> tuple[Shape, ...]:
     onions, tomatoes = split_content(content)
     cooking = timer >= 0
     broth = _broth(onions, tomatoes) if cooking else "#5d7f99"
-    inside = (circle(32, 32, 16.5, broth), *_ingredients(onions, tomatoes, 10.6, 0.66))
+    heap = _ingredients(onions, tomatoes, spacing=10.6, scale=0.66)
+    inside = (circle(32, 32, 16.5, broth), *place(heap, 32, 32))
     return (*pot, *inside, *_timer_shapes(timer, cook_time)) if cooking else (*pot, *inside)
 
 
@@ -216,8 +217,8 @@ def _timer_shapes(timer: int, cook_time: int) -> tuple[Shape, ...]:
         return (
             Arc(32, 32, 20, 0, 360, READY, 5),
             *(
-                Line(((x, 13), (x - 2.5, 9.5), (x + 1.5, 6.5), (x - 1, 3)), "#ffffff", 2.2)
-                for x in (22, 32, 42)
+                Line(((x + 1.8, 13), (x - 1.8, 9.5), (x + 1.8, 6), (x - 1.8, 2.5)), "#ffffff", 2.2)
+                for x in (22, 33)
             ),
             circle(51, 51, 10.5, READY, "#ffffff", 2.4),
             Line(((46, 51.2), (49.8, 55), (56.2, 47.4)), "#ffffff", 3),
@@ -246,7 +247,8 @@ def forbidden_floor_shapes() -> tuple[Shape, ...]:
 
 # A station that the partner may not use has a veil under its content and a "no" mark above it.
 FORBIDDEN_VEIL: tuple[Shape, ...] = (Rect(0, 0, TILE, TILE, "#f4efe6", opacity=0.55),)
-FORBIDDEN_MARK: tuple[Shape, ...] = (
-    circle(52, 12, 8, "#ffffff", FORBIDDEN, 2.8),
-    Line(((46.6, 17.4), (57.4, 6.6)), FORBIDDEN, 2.8),
+FORBIDDEN_SYMBOL: tuple[Shape, ...] = (
+    circle(0, 0, 4.2, "#ffffff", FORBIDDEN, 1.5),
+    Line(((-2.9, 2.9), (2.9, -2.9)), FORBIDDEN, 1.5),
 )
+FORBIDDEN_MARK = place(FORBIDDEN_SYMBOL, 52, 12, 1.9)
