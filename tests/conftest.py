@@ -1,0 +1,47 @@
+"""What all tests share: two host devices, a lasting compilation cache, one finished smoke run."""
+
+import os
+
+# XLA reports on every program that it loads from the compilation cache; read once, at start.
+os.environ.setdefault("TF_CPP_MIN_LOG_LEVEL", "3")
+os.environ.setdefault("TRANSFORMERS_NO_ADVISORY_WARNINGS", "1")
+
+import hypothesis
+import jax
+import pytest
+
+# Before the first computation: the code for populations must be tried on several devices.
+jax.config.update("jax_num_cpu_devices", 2)
+
+hypothesis.settings.register_profile(
+    "deterministic",
+    deadline=None,
+    derandomize=True,
+    database=None,
+    max_examples=15,
+    # Without shrinking: a failure is found in a second, and shrunk in a minute.
+    phases=[hypothesis.Phase.explicit, hypothesis.Phase.generate],
+    suppress_health_check=[hypothesis.HealthCheck.too_slow],
+)
+hypothesis.settings.load_profile("deterministic")
+
+
+def pytest_configure(config):
+    """Keeps compiled programs between runs of the tests, also for the commands they start."""
+    if getattr(config, "cache", None) is None:
+        return
+    folder = str(config.cache.mkdir("compiled"))
+    os.environ.setdefault("JAX_COMPILATION_CACHE_DIR", folder)
+    jax.config.update("jax_compilation_cache_dir", os.environ["JAX_COMPILATION_CACHE_DIR"])
+    jax.config.update("jax_persistent_cache_min_compile_time_secs", 0.3)
+
+
+@pytest.fixture(scope="session")
+def smoke_run(tmp_path_factory):
+    """The folder of an uninterrupted smoke run; not to be written to."""
+    from experiments import configs
+    from experiments.pipeline import run_pipeline
+
+    path = tmp_path_factory.mktemp("runs") / "smoke"
+    run_pipeline(configs.smoke(configs.DEFAULT_ENVIRONMENT, seed=0), path)
+    return path
