@@ -162,7 +162,7 @@ def quick(environment: str, seed: int) -> RunConfig:
             train_seeds=2,
             held_out_seeds=2,
             spare_seeds=0,
-            joint=PPOConfig(total_steps=800_000),
+            joint=PPOConfig(total_steps=900_000),
             refit=_refit(200_000),
             oracle=_refit(200_000),
             oracle_candidates=2,

@@ -132,7 +132,8 @@ def _update(
     confined = env.confine(style)
     bound = progress < config.confined_until
     style_now = jax.tree.map(lambda held, free: jnp.where(bound, held, free), confined, style)
-    random_share = _falling(config.random_start, config.final_random_start, progress)
+    remaining = (1 - progress) / (1 - config.random_start_until)
+    random_share = config.random_start * jnp.minimum(1.0, remaining)
     state, steps = _rollout(env, config, state, style_now, rollout_key, random_share)
 
     actors, critic = make_networks(env)

@@ -35,8 +35,8 @@ class PPOConfig:
         shaping_until: progress, 0 to 1, at which the shaped reward has gone.
         confined_until: progress up to which the ego is held to its role.
         random_start: share of games that start at a random moment, at the start of training;
-            it falls linearly to `final_random_start`.
-        final_random_start: the same at the end of training.
+            it falls linearly to 0 at the end.
+        random_start_until: progress up to which the share stays as it is.
     """
 
     total_steps: int = 1_000_000
@@ -58,7 +58,7 @@ class PPOConfig:
     shaping_until: float = 0.85
     confined_until: float = 0.55
     random_start: float = 0.9
-    final_random_start: float = 0.0
+    random_start_until: float = 0.5
 
     def __post_init__(self):
         if self.num_envs % self.num_minibatches:

@@ -189,6 +189,7 @@ class Overcooked:
             transition,
             pays=style.pays,
             hand_over=style.hand_over,
+            welcome=style.welcome,
             weights=self.weights,
         )
         return sum(terms.values(), start=jnp.zeros(2))

@@ -15,6 +15,9 @@ from envs.overcooked import dynamics
 from envs.overcooked.dynamics import Interaction, State, Transition
 from envs.overcooked.layouts import Layout
 
+IN_THE_WAY = -0.5
+"""Worth of a useless item on a counter that both players need, in hand-overs."""
+
 NUM_CONTENTS = 16
 """Content codes run from 0 to 12; the tables have 16 rows."""
 
@@ -36,7 +39,7 @@ class ShapingWeights:
     start_full: float = 1.0
     spoilt: float = -1.0
     unpaid_delivery: float = -1.0
-    hand_over: float = 2.0
+    hand_over: float = 1.0
 
 
 def order_values(orders: tuple[int, ...], soup_reward: float = 20.0) -> np.ndarray:
@@ -121,6 +124,7 @@ def guided_shaping_terms(
     *,
     pays: jax.Array,
     hand_over: jax.Array,
+    welcome: jax.Array,
     weights: ShapingWeights,
 ) -> dict[str, jax.Array]:
     """Returns our shaped reward by named term, each float32 [agent].
@@ -132,6 +136,8 @@ def guided_shaping_terms(
         hand_over: what each player earns by putting an item kind (onion, tomato, dish, soup)
             on a counter, float32 [agent, C, 4]. Taking it earns the opposite, so that nothing
             is won by putting a thing down and taking it back, whoever does it.
+        welcome: how many items of each kind are welcome on the shared counters at once,
+            float32 [4]; further ones are in the way.
         weights: the terms' weights.
     """
     did = transition.interactions
@@ -149,9 +155,16 @@ def guided_shaping_terms(
 
     counter = jnp.minimum(did.station, layout.num_counters - 1)
     kind = jnp.clip(did.item, 1, dynamics.SOUP) - 1
-    value = hand_over[np.arange(2), counter, kind]
     put = did.change == dynamics.PUT_ON_COUNTER
     picked = did.change == dynamics.TAKEN_FROM_COUNTER
+    shared = jnp.any(hand_over != 0, axis=(0, 2))
+    lying = jnp.stack([transition.before.counters, transition.between.counters])
+    alike = (jnp.clip(lying, 0, dynamics.SOUP) - 1 == kind[:, None]) & shared
+    # The item itself counts among those that lie there before it is taken, not before it is put.
+    others = jnp.sum(alike, axis=1) - picked
+    value = hand_over[np.arange(2), counter, kind]
+    crowded = shared[counter] & (others >= welcome[kind])
+    value = jnp.where(crowded, jnp.minimum(value, IN_THE_WAY), value)
     return {
         "potting": weights.potting * (potted & viable),
         "spoilt": weights.spoilt * (potted & ~viable),

@@ -20,6 +20,7 @@ FREE_STYLE = "free"
 """The only style of the classic kitchens: nothing is forbidden."""
 
 POOL_SIZE = 256
+ITEM_KINDS = events.ITEM_KINDS
 
 
 class Style(PyTreeNode):
@@ -36,6 +37,8 @@ class Style(PyTreeNode):
             where every style serves the same order.
         hand_over: what each player earns by putting an item kind on a counter, float32
             [agent, C, 4]; training only.
+        welcome: how many items of each kind are welcome on the shared counters at once,
+            float32 [4]; training only.
         pool: moments of games to start from in training, `State` with leading axis [pool];
             the first is the usual start.
     """
@@ -48,6 +51,7 @@ class Style(PyTreeNode):
     pays: jax.Array
     task: jax.Array
     hand_over: jax.Array
+    welcome: jax.Array
     pool: State
 
 
@@ -202,7 +206,8 @@ def build_style(layout: Layout, rule: Rule, *, max_steps: int) -> Style:
     partner_targets = np.array([rule.use(*station) for station in stations])
     role_targets = np.array([rule.role_use(*station) for station in stations])
     start = _start_cells(layout, rule, role_cells, partner_cells)
-    hand_over = _hand_over_worth(layout, rule, start, partner_cells, partner_targets)
+    shared = _shared_counters(layout, start, partner_cells, partner_targets)
+    hand_over = _hand_over_worth(rule, shared)
     task = np.zeros(0, np.float32)
     pays = np.tile(reward.order_values(layout.orders, layout.soup_reward), (len(stations), 1))
     if rule.order is not None:
@@ -213,7 +218,10 @@ def build_style(layout: Layout, rule: Rule, *, max_steps: int) -> Style:
         pays = np.where(np.arange(len(stations))[:, None] == paying, ordered, 0.0)
         task = np.zeros(2 + len(serving), np.float32)
         task[[0 if content == 12 else 1, 1 + number]] = 1
-    pool = _start_pool(layout, start, role_cells, partner_cells, max_steps)
+    codes = {"onion": (dynamics.ONION,), "tomato": (dynamics.TOMATO,), "dish": (dynamics.DISH,)}
+    codes["soup"] = tuple(dynamics.SOUP + content for content in layout.orders)
+    needed = tuple(code for kinds in rule.gives for kind in kinds for code in codes[kind])
+    pool = _start_pool(layout, start, role_cells, partner_cells, shared, needed, max_steps)
     style = Style(
         cells=np.stack([np.ones_like(partner_cells), partner_cells]),
         targets=np.stack([np.ones_like(partner_targets), partner_targets]),
@@ -223,6 +231,7 @@ def build_style(layout: Layout, rule: Rule, *, max_steps: int) -> Style:
         pays=pays.astype(np.float32),
         task=task,
         hand_over=hand_over,
+        welcome=_welcome_items(rule),
         pool=pool,
     )
     return jax.tree.map(jnp.asarray, style)
@@ -263,27 +272,41 @@ def _start_cells(
     return np.array(chosen[::-1], np.int32)
 
 
-def _hand_over_worth(
-    layout: Layout,
-    rule: Rule,
-    start: np.ndarray,
-    partner_cells: np.ndarray,
-    partner_targets: np.ndarray,
+def _shared_counters(
+    layout: Layout, start: np.ndarray, partner_cells: np.ndarray, partner_targets: np.ndarray
 ) -> np.ndarray:
-    """What putting earns on counters that both players use.
+    """Counters that both players reach and may use, bool [C]."""
+    ego_side = layout.stations_beside(_room(layout, int(start[0])))
+    partner_side = layout.stations_beside(partner_cells & _room(layout, int(start[1])))
+    return (ego_side & partner_side & partner_targets)[: layout.num_counters]
 
-    The giver of a needed kind earns 1 by putting it there, and its taker 1 by taking it;
-    anything else is in the way and costs 1.
+
+def _hand_over_worth(rule: Rule, shared: np.ndarray) -> np.ndarray:
+    """What putting an item kind on each counter earns, float32 [agent, C, 4].
+
+    The giver of a needed kind earns 1 by putting it on a shared counter, and its taker 1 by
+    taking it; anything else is in the way there.
     """
-    worth = np.zeros((2, layout.num_counters, 4), np.float32)
+    worth = np.zeros((2, len(shared), 4), np.float32)
     if any(rule.gives):
-        ego_side = layout.stations_beside(_room(layout, int(start[0])))
-        partner_side = layout.stations_beside(partner_cells & _room(layout, int(start[1])))
-        shared = (ego_side & partner_side & partner_targets)[: layout.num_counters]
         for agent in (0, 1):
-            values = [1.0 if kind in rule.gives[agent] else -1.0 for kind in events.ITEM_KINDS]
+            values = [
+                1.0 if kind in rule.gives[agent] else reward.IN_THE_WAY for kind in ITEM_KINDS
+            ]
             worth[agent, shared] = values
+        # Taking is paid with the opposite sign, so what the other gives is worth -1 to put back.
+        for agent in (0, 1):
+            given = [kind in rule.gives[1 - agent] for kind in ITEM_KINDS]
+            worth[agent][np.ix_(shared, given)] = -1.0
     return worth
+
+
+def _welcome_items(rule: Rule) -> np.ndarray:
+    """Where several kinds share the counters, two ingredients and one of any other are enough."""
+    kinds = {kind for given in rule.gives for kind in given}
+    if len(kinds) < 2:
+        return np.full(4, np.inf, np.float32)
+    return np.array([2, 2, 1, 1], np.float32)
 
 
 def _start_pool(
@@ -291,13 +314,15 @@ def _start_pool(
     start: np.ndarray,
     ego_cells: np.ndarray,
     partner_cells: np.ndarray,
+    shared: np.ndarray,
+    needed: tuple[int, ...],
     max_steps: int,
 ) -> State:
     """Draws moments to start from; computed once, since drawing on every reset is slow."""
     random = np.random.default_rng(0)
     moments = [jax.tree.map(np.asarray, dynamics.start_state(layout, start))]
     moments += [
-        _random_moment(layout, random, start, ego_cells, partner_cells, max_steps)
+        _random_moment(layout, random, start, ego_cells, partner_cells, shared, needed, max_steps)
         for _ in range(POOL_SIZE - 1)
     ]
     return jax.tree.map(lambda *leaves: np.stack(leaves), *moments)
@@ -309,9 +334,15 @@ def _random_moment(
     start: np.ndarray,
     ego_cells: np.ndarray,
     partner_cells: np.ndarray,
+    shared: np.ndarray,
+    needed: tuple[int, ...],
     max_steps: int,
 ) -> State:
-    """A random moment of a game: places, hands, counters, pots and the time left."""
+    """A random moment of a game: places, hands, counters, pots and the time left.
+
+    On half of the shared counters lies something that one player needs from the other, so
+    that each can learn its part before the other has learnt to give.
+    """
     soups = [dynamics.SOUP + content for content in layout.orders]
     ingredients = [dynamics.ONION] + [dynamics.TOMATO] * layout.has_tomatoes
     items = [*ingredients, dynamics.DISH, *soups]
@@ -325,6 +356,10 @@ def _random_moment(
     ego_room = ego_cells & _room(layout, int(start[0]))
     ego_room[partner] = False
     ego = random.choice(np.flatnonzero(ego_room))
+    counters = draw_items(layout.num_counters, 0.1)
+    if needed:
+        offered = random.choice(needed, layout.num_counters)
+        counters = np.where(shared & (random.random(len(shared)) < 0.5), offered, counters)
     amounts = random.integers(0, 4, layout.num_pots)
     units = random.choice([4, 1][: len(ingredients)], layout.num_pots)
     cooking = (amounts == 3) & (random.random(layout.num_pots) < 0.7)
@@ -333,7 +368,7 @@ def _random_moment(
         cell=np.array([ego, partner], np.int32),
         orientation=random.integers(0, 4, 2).astype(np.int32),
         held=draw_items(2, 0.5),
-        counters=draw_items(layout.num_counters, 0.15),
+        counters=counters.astype(np.int32),
         pot_content=(amounts * units).astype(np.int32),
         pot_timer=np.where(cooking, timer, dynamics.IDLE).astype(np.int32),
         time=np.array(random.integers(max(0, max_steps - 200), max_steps - 40), np.int32),
