@@ -66,6 +66,19 @@ class Environment(Protocol):
         """Starts a game; consumes `key`."""
         ...
 
+    def training_reset(
+        self, key: jax.Array, style: Any, random_share: jax.Array | float
+    ) -> tuple[Any, TimeStep]:
+        """Starts a game or, with chance `random_share`, goes on from a random moment of one.
+
+        Training only; an environment without such moments does what `reset` does.
+        """
+        ...
+
+    def confine(self, style: Any) -> Any:
+        """Returns the style with the ego held to its intended role: a curriculum for training."""
+        ...
+
     def step(self, key: jax.Array, state: Any, actions: Pair, style: Any) -> tuple[Any, TimeStep]:
         """Plays one step; consumes `key`."""
         ...

@@ -57,6 +57,7 @@ class Haland:
     tokenizer: Any
     style_names: tuple[str, ...]
     v_hat: jax.Array
+    _programs: dict[str, Any] = dataclasses.field(init=False, repr=False, compare=False)
 
     def __post_init__(self):
         vae = PolicyVAE(self.architecture, self.vae_config)
@@ -75,9 +76,12 @@ class Haland:
             return Generation(policy, latent, v_hat[0], logits[0])
 
         many = jax.vmap(from_task_language, in_axes=(None, 0, 0, None))
-        object.__setattr__(self, "_from_tokens", jax.jit(from_tokens, static_argnums=4))
-        object.__setattr__(self, "_from_task_language", jax.jit(many, static_argnums=3))
-        object.__setattr__(self, "_translate", jax.jit(Translator.__call__))
+        programs = {
+            "from_tokens": jax.jit(from_tokens, static_argnums=4),
+            "from_task_language": jax.jit(many, static_argnums=3),
+            "translate": jax.jit(Translator.__call__),
+        }
+        object.__setattr__(self, "_programs", programs)
 
     @property
     def params(self) -> tuple[Any, DiffusionParams, Any]:
@@ -100,7 +104,7 @@ class Haland:
             ValueError: the sentence is blank or too long.
         """
         token_ids, mask = self._tokens([sentence])
-        return self._from_tokens(self.params, key, token_ids[0], mask[0], sampler)
+        return self._programs["from_tokens"](self.params, key, token_ids[0], mask[0], sampler)
 
     def translate(self, sentences: Sequence[str]) -> tuple[jax.Array, jax.Array]:
         """Returns the sentences' task language [B, U] and style logits [B, style].
@@ -108,7 +112,7 @@ class Haland:
         Raises:
             ValueError: a sentence is blank or too long.
         """
-        return self._translate(self.translator, *self._tokens(sentences))
+        return self._programs["translate"](self.translator, *self._tokens(sentences))
 
     def generate_from_task_language(
         self, v_hat: jax.Array, keys: jax.Array, *, sampler: str = "ddim"
@@ -123,7 +127,7 @@ class Haland:
         Returns:
             Policies and latents z, leading axis [B].
         """
-        return self._from_task_language(self.params, keys, v_hat, sampler)
+        return self._programs["from_task_language"](self.params, keys, v_hat, sampler)
 
     def nearest_style(self, v_hat: jax.Array) -> jax.Array:
         """Returns the index of the style whose task language is nearest, int32 [...]."""

@@ -236,7 +236,7 @@ def _frozen_partners(actor: MLPActor, policies: Policy, observation: jax.Array) 
 
 def _make_batch(
     config: PPOConfig,
-    critic: MLPCritic,
+    critic: Any,
     learner: Learner,
     steps: dict[str, Any],
     last_observation: jax.Array,
@@ -262,8 +262,8 @@ def _make_batch(
 
 def _learn(
     config: PPOConfig,
-    actor: MLPActor,
-    critic: MLPCritic,
+    actor: Any,
+    critic: Any,
     learner: Learner,
     batch: Batch,
     *,
@@ -295,5 +295,5 @@ def _learn(
 
     carry = ((learner.actor, learner.critic), learner.optimizer_state)
     order = jnp.tile(jnp.arange(config.num_minibatches), config.epochs)
-    (params, optimizer_state), losses = jax.lax.scan(one_step, carry, order)
-    return Learner(*params, optimizer_state), jnp.mean(losses)
+    ((actor_params, critic_params), optimizer_state), losses = jax.lax.scan(one_step, carry, order)
+    return Learner(actor_params, critic_params, optimizer_state), jnp.mean(losses)

@@ -8,7 +8,7 @@ import jax.numpy as jnp
 from flax.struct import PyTreeNode
 
 from haland_jax import networks
-from haland_jax.networks import MLPActor, MLPCritic, Policy
+from haland_jax.networks import Policy
 
 
 @dataclasses.dataclass(frozen=True)
@@ -131,14 +131,15 @@ def generalised_advantages(
 def ppo_loss(
     params: tuple[Policy, Any],
     batch: Batch,
-    actor: MLPActor,
-    critic: MLPCritic,
+    actor: Any,
+    critic: Any,
     config: PPOConfig,
     entropy_weight: jax.Array,
 ) -> jax.Array:
     """Clipped surrogate, value loss and entropy bonus, mean over the batch.
 
-    Schulman et al. (2017), Eq. 7 and 9; advantages are normalised over the minibatch.
+    `actor` and `critic` are the Linen modules of the two parameter trees. Schulman et al. (2017),
+    Eq. 7 and 9; advantages are normalised over the minibatch.
     """
     actor_params, critic_params = params
     distribution = actor.apply(actor_params, batch.observation)

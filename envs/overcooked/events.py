@@ -179,7 +179,7 @@ def reference_events(layout: Layout, transition: Transition) -> dict[str, jax.Ar
     }
     log["useful_dish_pickup"] = log["dish_pickup"] & dish_useful
     log["useful_dish_drop"] = log["dish_drop"] & dish_drop_useful
-    reachable = reward.reachable_values(reward.order_values(layout.orders))
+    reachable = reward.reachable_values(jnp.asarray(reward.order_values(layout.orders)))
     after = did.content + jnp.where(items["onion"], 4, 1)
     old_value = reachable[did.content]
     new_value = reachable[jnp.minimum(after, reward.NUM_CONTENTS - 1)]

@@ -128,7 +128,7 @@ def parse_layout(name: str, text: str) -> Layout:
         if (x, y) in beside_floor
     ]
     station_index = {cell: i for i, cell in enumerate(stations)}
-    kinds = [STATION_KINDS.index(letters[y, x]) for x, y in stations]
+    kinds = [STATION_KINDS.index(str(letters[y, x])) for x, y in stations]
 
     neighbour = np.zeros((len(floor), 4), np.int32)
     facing = np.full((len(floor), 4), len(stations), np.int32)

@@ -6,6 +6,7 @@ training only, the role that the ego is meant to take and what is worth handing 
 
 import dataclasses
 from collections.abc import Callable
+from typing import Any
 
 import jax
 import jax.numpy as jnp
@@ -208,7 +209,7 @@ def build_style(layout: Layout, rule: Rule, *, max_steps: int) -> Style:
     start = _start_cells(layout, rule, role_cells, partner_cells)
     shared = _shared_counters(layout, start, partner_cells, partner_targets)
     hand_over = _hand_over_worth(rule, shared)
-    task = np.zeros(0, np.float32)
+    task: Any = np.zeros(0, np.float32)
     pays = np.tile(reward.order_values(layout.orders, layout.soup_reward), (len(stations), 1))
     if rule.order is not None:
         content, number = rule.order
@@ -217,24 +218,24 @@ def build_style(layout: Layout, rule: Rule, *, max_steps: int) -> Style:
         ordered = reward.order_values((content,), layout.soup_reward)
         pays = np.where(np.arange(len(stations))[:, None] == paying, ordered, 0.0)
         task = np.zeros(2 + len(serving), np.float32)
-        task[[0 if content == 12 else 1, 1 + number]] = 1
+        task[np.array([0 if content == 12 else 1, 1 + number])] = 1
     codes = {"onion": (dynamics.ONION,), "tomato": (dynamics.TOMATO,), "dish": (dynamics.DISH,)}
     codes["soup"] = tuple(dynamics.SOUP + content for content in layout.orders)
     needed = tuple(code for kinds in rule.gives for kind in kinds for code in codes[kind])
     pool = _start_pool(layout, start, role_cells, partner_cells, shared, needed, max_steps)
-    style = Style(
-        cells=np.stack([np.ones_like(partner_cells), partner_cells]),
-        targets=np.stack([np.ones_like(partner_targets), partner_targets]),
-        role_cells=role_cells,
-        role_targets=role_targets,
-        start=start,
-        pays=pays.astype(np.float32),
-        task=task,
-        hand_over=hand_over,
-        welcome=_welcome_items(rule),
-        pool=pool,
-    )
-    return jax.tree.map(jnp.asarray, style)
+    arrays: dict[str, Any] = {
+        "cells": np.stack([np.ones_like(partner_cells), partner_cells]),
+        "targets": np.stack([np.ones_like(partner_targets), partner_targets]),
+        "role_cells": role_cells,
+        "role_targets": role_targets,
+        "start": start,
+        "pays": pays.astype(np.float32),
+        "task": task,
+        "hand_over": hand_over,
+        "welcome": _welcome_items(rule),
+        "pool": pool,
+    }
+    return jax.tree.map(jnp.asarray, Style(**arrays))
 
 
 def confine(style: Style) -> Style:
@@ -296,8 +297,8 @@ def _hand_over_worth(rule: Rule, shared: np.ndarray) -> np.ndarray:
             worth[agent, shared] = values
         # Taking is paid with the opposite sign, so what the other gives is worth -1 to put back.
         for agent in (0, 1):
-            given = [kind in rule.gives[1 - agent] for kind in ITEM_KINDS]
-            worth[agent][np.ix_(shared, given)] = -1.0
+            given = np.array([kind in rule.gives[1 - agent] for kind in ITEM_KINDS])
+            worth[agent][shared[:, None] & given] = -1.0
     return worth
 
 
@@ -320,7 +321,7 @@ def _start_pool(
 ) -> State:
     """Draws moments to start from; computed once, since drawing on every reset is slow."""
     random = np.random.default_rng(0)
-    moments = [jax.tree.map(np.asarray, dynamics.start_state(layout, start))]
+    moments = [jax.tree.map(np.asarray, dynamics.start_state(layout, jnp.asarray(start)))]
     moments += [
         _random_moment(layout, random, start, ego_cells, partner_cells, shared, needed, max_steps)
         for _ in range(POOL_SIZE - 1)
@@ -364,12 +365,13 @@ def _random_moment(
     units = random.choice([4, 1][: len(ingredients)], layout.num_pots)
     cooking = (amounts == 3) & (random.random(layout.num_pots) < 0.7)
     timer = random.integers(0, layout.cook_time + 1, layout.num_pots)
-    return State(
-        cell=np.array([ego, partner], np.int32),
-        orientation=random.integers(0, 4, 2).astype(np.int32),
-        held=draw_items(2, 0.5),
-        counters=counters.astype(np.int32),
-        pot_content=(amounts * units).astype(np.int32),
-        pot_timer=np.where(cooking, timer, dynamics.IDLE).astype(np.int32),
-        time=np.array(random.integers(max(0, max_steps - 200), max_steps - 40), np.int32),
-    )
+    arrays: dict[str, Any] = {
+        "cell": np.array([ego, partner], np.int32),
+        "orientation": random.integers(0, 4, 2).astype(np.int32),
+        "held": draw_items(2, 0.5),
+        "counters": counters.astype(np.int32),
+        "pot_content": (amounts * units).astype(np.int32),
+        "pot_timer": np.where(cooking, timer, dynamics.IDLE).astype(np.int32),
+        "time": np.array(random.integers(max(0, max_steps - 200), max_steps - 40), np.int32),
+    }
+    return State(**arrays)

@@ -78,14 +78,15 @@ def load_population(run: Run) -> Population:
     egos = Player(shapes.ego.actor, shapes.ego.critic)
     train, held_out = config.train_seeds, config.held_out_seeds
     styles = len(env.style_names)
+    shape: Any = jax.ShapeDtypeStruct
     like = Population(
         train_partners=seeds(shapes.partner.actor, train),
         held_out_partners=seeds(shapes.partner.actor, held_out),
         train_egos=seeds(egos, train),
         held_out_egos=seeds(egos, held_out),
-        joint_returns=jax.ShapeDtypeStruct((styles, config.num_seeds), jnp.float32),
-        train_index=jax.ShapeDtypeStruct((styles, train), jnp.int32),
-        held_out_index=jax.ShapeDtypeStruct((styles, held_out), jnp.int32),
+        joint_returns=shape((styles, config.num_seeds), jnp.float32),
+        train_index=shape((styles, train), jnp.int32),
+        held_out_index=shape((styles, held_out), jnp.int32),
     )
     return checkpoint.restore(run.path("partners", "population"), like)
 
@@ -169,7 +170,7 @@ def make_task_language(run: Run, task: StageProgress) -> dict[str, Any]:
     lengths = partners.unflatten(played.lengths, len(env.style_names))
     names = task_language.agent_event_names(env.event_names, envs.AGENTS)
     language = task_language.build_task_language(
-        task_language.event_frequencies(counts, np.asarray(lengths)), names
+        task_language.event_frequencies(counts, lengths), names
     )
     checkpoint.save(
         run.path("task_language", "language"),
