@@ -209,7 +209,7 @@ def build_style(layout: Layout, rule: Rule, *, max_steps: int) -> Style:
     start = _start_cells(layout, rule, role_cells, partner_cells)
     shared = _shared_counters(layout, start, partner_cells, partner_targets)
     hand_over = _hand_over_worth(rule, shared)
-    task: Any = np.zeros(0, np.float32)
+    task = np.zeros(0, np.float32)
     pays = np.tile(reward.order_values(layout.orders, layout.soup_reward), (len(stations), 1))
     if rule.order is not None:
         content, number = rule.order
@@ -218,9 +218,13 @@ def build_style(layout: Layout, rule: Rule, *, max_steps: int) -> Style:
         ordered = reward.order_values((content,), layout.soup_reward)
         pays = np.where(np.arange(len(stations))[:, None] == paying, ordered, 0.0)
         task = np.zeros(2 + len(serving), np.float32)
-        task[np.array([0 if content == 12 else 1, 1 + number])] = 1
-    codes = {"onion": (dynamics.ONION,), "tomato": (dynamics.TOMATO,), "dish": (dynamics.DISH,)}
-    codes["soup"] = tuple(dynamics.SOUP + content for content in layout.orders)
+        task[[0 if content == 12 else 1, 1 + number]] = 1
+    codes: dict[str, tuple[int, ...]] = {
+        "onion": (dynamics.ONION,),
+        "tomato": (dynamics.TOMATO,),
+        "dish": (dynamics.DISH,),
+        "soup": tuple(dynamics.SOUP + content for content in layout.orders),
+    }
     needed = tuple(code for kinds in rule.gives for kind in kinds for code in codes[kind])
     pool = _start_pool(layout, start, role_cells, partner_cells, shared, needed, max_steps)
     arrays: dict[str, Any] = {
