@@ -1,0 +1,5 @@
+"""The environments as other packages know them; each adapter is imported by itself.
+
+from envs.adapters.jaxmarl import JaxMARLEnvironment
+from envs.adapters.pettingzoo import PettingZooEnvironment
+"""
