@@ -205,7 +205,7 @@ def draw(layout, start: int, cells: np.ndarray, targets: np.ndarray) -> list[str
 
 @pytest.fixture(scope="module")
 def kitchens():
-    return {name: envs.make(f"overcooked/{name}") for name in layouts.STYLED + ("cramped_room",)}
+    return {name: envs.make(f"overcooked/{name}") for name in (*layouts.STYLED, "cramped_room")}
 
 
 @pytest.mark.parametrize("kitchen", DRAWINGS)
@@ -316,8 +316,15 @@ def test_only_what_is_needed_is_worth_handing_over(kitchens, kitchen, name):
     for counter, (x, y) in enumerate(env.layout.stations[: env.layout.num_counters]):
         for agent in (0, 1):
             for kind, item in enumerate(("onion", "tomato", "dish", "soup")):
-                wanted = 0 if y != 2 or x not in over else (1 if item in gives[agent] else -1)
+                if y != 2 or x not in over:
+                    wanted = 0
+                elif item in gives[agent]:
+                    wanted = 1
+                else:
+                    # Taking earns the opposite of putting: the taker of a gift earns 1.
+                    wanted = -1 if item in gives[1 - agent] else styles.JUNK_WORTH
                 assert worth[agent, counter, kind] == wanted, (x, y, agent, item)
+    assert styles.JUNK_WORTH < 0
 
 
 def test_nothing_is_handed_over_where_both_reach_everything(kitchens):

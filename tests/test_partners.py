@@ -1,0 +1,211 @@
+"""Partners: how seeds are chosen and dealt out, and what each kind of training starts from."""
+
+import dataclasses
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+from toy_game import ToyGame, always
+
+from haland_jax import partners
+from haland_jax.partners import PartnersConfig, Player, select_seeds
+from haland_jax.ppo import PPOConfig
+
+TINY = PPOConfig(
+    total_steps=80, num_envs=4, rollout_steps=5, num_minibatches=2, epochs=1, confined_until=0.0
+)
+CONFIG = PartnersConfig(
+    train_seeds=2,
+    held_out_seeds=2,
+    spare_seeds=1,
+    joint=TINY,
+    refit=TINY,
+    oracle=TINY,
+    oracle_candidates=2,
+    evaluation_games=3,
+)
+# By style and seed; the third seed of the first style and the first of the second are the worst.
+RETURNS = np.array([[10.0, 40.0, 5.0, 30.0, 20.0], [1.0, 2.0, 3.0, 4.0, 5.0]])
+
+
+@pytest.fixture(scope="module")
+def game():
+    return ToyGame()
+
+
+@pytest.fixture(scope="module")
+def pairs(game):
+    return partners.init_pairs(game, CONFIG, jax.random.key(0))
+
+
+@pytest.fixture(scope="module")
+def population(game, pairs):
+    # Egos differ after training; here each is marked by its member's number.
+    marks = jnp.arange(10, dtype=jnp.float32)
+    marked = jax.tree.map(
+        lambda leaf: leaf + marks.reshape(-1, *[1] * (leaf.ndim - 1)), pairs.ego.actor
+    )
+    pairs = pairs.replace(ego=pairs.ego.replace(actor=marked))
+    return partners.make_population(game, CONFIG, pairs, RETURNS)
+
+
+def mark(actor) -> np.ndarray:
+    """The member's number that the fixture wrote into the last bias."""
+    return np.asarray(actor["params"]["dense_2"]["bias"][..., 0]).round().astype(int)
+
+
+def test_the_best_seeds_are_kept_and_dealt_out_in_turn():
+    train, held_out = select_seeds(RETURNS, 2, 2)
+    # Ranks: 40 (seed 1), 30 (3), 20 (4), 10 (0); 5, 4, 3, 2.
+    np.testing.assert_array_equal(train, [[1, 4], [4, 2]])
+    np.testing.assert_array_equal(held_out, [[3, 0], [3, 1]])
+
+
+@pytest.mark.parametrize("num_train", range(1, 6))
+@pytest.mark.parametrize("num_held_out", range(1, 6))
+def test_every_kept_seed_is_dealt_once_and_neither_group_is_the_better(num_train, num_held_out):
+    kept = num_train + num_held_out
+    returns = np.random.default_rng(0).permuted(np.arange(3 * 12.0).reshape(3, 12), axis=1)
+    train, held_out = select_seeds(returns, num_train, num_held_out)
+    assert train.shape == (3, num_train)
+    assert held_out.shape == (3, num_held_out)
+    for style in range(3):
+        together = [*train[style], *held_out[style]]
+        best = np.argsort(-returns[style])[:kept]
+        assert sorted(together) == sorted(best)
+    if num_train == num_held_out:
+        rank = np.argsort(np.argsort(-returns, axis=1), axis=1)
+        ranks = [np.take_along_axis(rank, index, 1).mean() for index in (train, held_out)]
+        assert abs(ranks[0] - ranks[1]) <= 1
+
+
+def test_equal_returns_are_taken_in_the_order_of_the_seeds():
+    train, held_out = select_seeds(np.zeros((1, 4)), 1, 1)
+    assert (train.tolist(), held_out.tolist()) == ([[0]], [[1]])
+
+
+def test_flatten_and_unflatten_are_inverse_and_take_seeds_picks_by_style():
+    tree = {"a": jnp.arange(24).reshape(2, 4, 3), "b": jnp.arange(8).reshape(2, 4)}
+    flat = partners.flatten(tree)
+    np.testing.assert_array_equal(flat["b"], np.arange(8))
+    assert flat["a"].shape == (8, 3)
+    back = partners.unflatten(flat, 2)
+    jax.tree.map(np.testing.assert_array_equal, back, tree)
+    picked = partners.take_seeds(tree, np.array([[3, 0], [1, 1]]))
+    np.testing.assert_array_equal(picked["b"], [[3, 0], [5, 5]])
+    np.testing.assert_array_equal(picked["a"][0, 0], tree["a"][0, 3])
+
+
+def test_members_are_ordered_by_style_then_seed(game):
+    np.testing.assert_array_equal(partners.repeat_styles(game, 3).length, [3, 3, 3, 5, 5, 5])
+
+
+def test_all_egos_start_alike_and_all_partners_apart(pairs):
+    for leaf in jax.tree.leaves((pairs.ego.actor, pairs.ego.critic)):
+        assert leaf.shape[0] == 10
+        np.testing.assert_array_equal(leaf, np.broadcast_to(leaf[:1], leaf.shape))
+    kernels = np.asarray(pairs.partner.actor["params"]["dense_0"]["kernel"]).reshape(10, -1)
+    assert len({kernel.tobytes() for kernel in kernels}) == 10
+    keys = np.asarray(jax.random.key_data(pairs.key))
+    assert len({key.tobytes() for key in keys}) == 10
+
+
+def test_the_population_holds_the_chosen_pairs(pairs, population):
+    np.testing.assert_array_equal(mark(population.train_egos.actor), [[1, 4], [9, 7]])
+    np.testing.assert_array_equal(mark(population.held_out_egos.actor), [[3, 0], [8, 6]])
+    for kept, members in (
+        (population.train_partners, [[1, 4], [9, 7]]),
+        (population.held_out_partners, [[3, 0], [8, 6]]),
+    ):
+        jax.tree.map(
+            lambda leaf, every, index=members: np.testing.assert_array_equal(
+                leaf, np.asarray(every)[np.array(index)]
+            ),
+            kept,
+            pairs.partner.actor,
+        )
+    np.testing.assert_array_equal(population.joint_returns, RETURNS)
+    np.testing.assert_array_equal(population.train_index, [[1, 4], [4, 2]])
+
+
+def test_each_ego_is_refitted_against_all_training_partners_of_its_style(game, population):
+    state = partners.best_response_refits(game, CONFIG, jax.random.key(1), population)
+    np.testing.assert_array_equal(mark(state.ego.actor), [1, 4, 9, 7])
+    for frozen, trained in zip(
+        jax.tree.leaves(state.partner), jax.tree.leaves(population.train_partners), strict=True
+    ):
+        # [member, partner, ...]: both training partners of the member's style.
+        np.testing.assert_array_equal(frozen, np.asarray(trained)[[0, 0, 1, 1]])
+
+
+def test_refits_change_the_egos_and_leave_the_partners_alone(game, population):
+    state = partners.best_response_refits(game, CONFIG, jax.random.key(1), population)
+    before = jax.tree.map(np.array, (state.ego.actor, state.partner))
+    train = partners.compile_training(game, CONFIG.refit, 2)
+    state, metrics = train(state, partners.repeat_styles(game, CONFIG.train_seeds))
+    assert metrics["reward"].shape == (4, 2)
+    jax.tree.map(np.testing.assert_array_equal, before[1], state.partner)
+    change = np.abs(
+        before[0]["params"]["dense_1"]["kernel"] - state.ego.actor["params"]["dense_1"]["kernel"]
+    )
+    assert (change.reshape(4, -1).max(axis=1) > 0).all()
+
+
+def test_the_oracles_candidates_are_the_own_ego_and_archived_ones(game, population):
+    archived = Player(
+        jax.tree.map(lambda leaf: leaf + 100, population.train_egos.actor),
+        population.train_egos.critic,
+    )
+    state = partners.oracle_refits(game, CONFIG, jax.random.key(2), population, archived)
+    # [style, held-out partner, candidate]: the own ego, then an archived one, in turn.
+    np.testing.assert_array_equal(
+        mark(state.ego.actor).reshape(2, 2, 2),
+        [[[3, 101], [0, 104]], [[8, 109], [6, 107]]],
+    )
+    for frozen, held_out in zip(
+        jax.tree.leaves(state.partner), jax.tree.leaves(population.held_out_partners), strict=True
+    ):
+        # [member, 1, ...]: each held-out partner with each of its candidates.
+        expected = np.repeat(np.asarray(held_out).reshape(4, 1, *held_out.shape[2:]), 2, axis=0)
+        np.testing.assert_array_equal(frozen, expected)
+
+
+def test_evaluation_plays_every_pair_with_its_style(game):
+    egos = [always(action, 3, 3) for action in (0, 1, 2)]
+    egos = jax.tree.map(lambda *leaves: jnp.stack(leaves), *egos)
+    idle = jax.tree.map(lambda leaf: jnp.stack(3 * [leaf]), always(0, 2, 4))
+    styles = jax.tree.map(lambda leaf: leaf[np.array([0, 1, 0])], game.styles)
+    keys = jax.random.split(jax.random.key(0), 3)
+    played = partners.compile_evaluation(game, 2)(keys, egos, idle, styles)
+    np.testing.assert_array_equal(played.returns, [[0, 0], [5, 5], [6, 6]])
+
+
+def test_visited_observations_are_of_games_that_are_on(game):
+    visited = jax.jit(
+        lambda key: partners.visited_observations(
+            game,
+            key,
+            always(1, 3, 3),
+            always(0, 2, 4),
+            game.style("short"),
+            num_games=4,
+            num_kept=200,
+        )
+    )(jax.random.key(0))
+    assert visited.shape == (200, 3)
+    # The short game is over after three steps: times 0, 1 and 2 of 5 are seen, and all of them.
+    np.testing.assert_allclose(np.unique(np.asarray(visited[:, 1])), [0.0, 0.2, 0.4], atol=1e-6)
+    assert len(np.unique(np.asarray(visited[:, 2]))) == 4, "states of all games are drawn"
+
+
+@pytest.mark.parametrize("name", ["train_seeds", "held_out_seeds", "oracle_candidates"])
+def test_numbers_below_one_are_refused(name):
+    with pytest.raises(ValueError, match=f"{name} is 0; expected at least 1"):
+        PartnersConfig(**{name: 0})
+
+
+def test_refit_games_must_be_shared_by_the_partners():
+    odd = dataclasses.replace(CONFIG.refit, num_envs=32)
+    with pytest.raises(ValueError, match=r"refit\.num_envs is 32; expected a multiple .* = 5"):
+        PartnersConfig(train_seeds=5, refit=odd)
