@@ -1,5 +1,6 @@
 """Deliveries and shaped rewards, each term in a transition in which it fires."""
 
+import jax
 import numpy as np
 import pytest
 from drawn_kitchen import DrawnKitchen, content_code
@@ -8,17 +9,28 @@ import envs
 from envs.overcooked import reward
 from envs.overcooked.reward import ShapingWeights
 
+WEIGHTS = ShapingWeights(
+    potting=3.0,
+    dish=3.0,
+    soup_taken=5.0,
+    unordered_soup_taken=2.0,
+    start_full=1.0,
+    spoilt=-1.0,
+    unpaid_delivery=-1.0,
+    hand_over=2.0,
+)
+
 
 @pytest.fixture(scope="module")
 def rooms():
     """Two rooms: the ego above must give onions, the partner below cooks on the left."""
-    return envs.make("overcooked/diverse_coordination")
+    return envs.make("overcooked/diverse_coordination", weights=WEIGHTS)
 
 
 @pytest.fixture(scope="module")
 def orders():
     """Two rooms with tomatoes: only the named soup at the named serving cell pays."""
-    return envs.make("overcooked/diverse_orders")
+    return envs.make("overcooked/diverse_orders", weights=WEIGHTS)
 
 
 @pytest.fixture
@@ -26,16 +38,20 @@ def kitchen(rooms):
     return DrawnKitchen(rooms.layout, rooms.style("left_no_onion"))
 
 
-def terms(env, style_name: str, transition) -> dict[str, list[float]]:
-    """The guided shaping's terms that are not zero for both players."""
-    style = env.style(style_name)
-    found = reward.guided_shaping_terms(
+def guided(env, style, transition):
+    return reward.guided_shaping_terms(
         env.layout,
         transition,
         pays=style.pays,
         hand_over=style.hand_over,
-        weights=ShapingWeights(),
+        welcome=style.welcome,
+        weights=WEIGHTS,
     )
+
+
+def terms(env, style_name: str, transition) -> dict[str, list[float]]:
+    """The guided shaping's terms that are not zero for both players."""
+    found = guided(env, env.style(style_name), transition)
     return {name: np.asarray(v).tolist() for name, v in found.items() if np.any(np.asarray(v))}
 
 
@@ -150,16 +166,23 @@ def test_nothing_is_earned_by_passing_a_thing_round(rooms, kitchen):
     np.testing.assert_array_equal(total, 0)
 
 
+def test_further_things_are_in_the_way_where_several_kinds_share_the_counters(orders):
+    style = orders.style("onion_2")
+    kitchen = DrawnKitchen(orders.layout, style)
+    assert float(style.welcome[2]) == 1
+    for x, worth in ((3, 1.0), (4, reward.IN_THE_WAY)):
+        kitchen.place(1, x, 3, facing="north", held="dish")
+        put = terms(orders, "onion_2", kitchen.play("stay", "interact"))
+        assert put == {"hand_over": [0, 2 * worth]}
+    # Taking the second back returns its price, whichever of the two is taken first.
+    kitchen.place(1, 3, 3, facing="north")
+    taken = terms(orders, "onion_2", kitchen.play("stay", "interact"))
+    assert taken == {"hand_over": [0, -2 * reward.IN_THE_WAY]}
+
+
 def test_every_guided_term_was_seen_in_these_tests(rooms, kitchen):
     """Fails when a term is added without a transition in which it fires."""
-    style = rooms.style("left_no_onion")
-    found = reward.guided_shaping_terms(
-        rooms.layout,
-        kitchen.play(),
-        pays=style.pays,
-        hand_over=style.hand_over,
-        weights=ShapingWeights(),
-    )
+    found = guided(rooms, rooms.style("left_no_onion"), kitchen.play())
     assert set(found) == {
         *("potting", "spoilt", "dish", "start_full", "soup_taken"),
         *("unordered_soup_taken", "unpaid_delivery", "hand_over"),
@@ -186,12 +209,13 @@ def test_reference_shaping_pays_any_potting_dish_and_soup(orders):
 
 def test_the_environment_adds_the_terms_up_or_takes_the_reference(rooms, kitchen):
     reference = envs.make("overcooked/diverse_coordination", shaping="reference")
+    key = jax.random.key(0)
     style = rooms.style("left_no_onion")
     kitchen.place(0, 2, 1, facing="south", held="onion")
     kitchen.place(1, 2, 3, facing="south", held="onion")
     actions = envs.Pair(np.int32(5), np.int32(5))
-    _, guided = rooms.step(None, kitchen.state, actions, style)
-    _, plain = reference.step(None, kitchen.state, actions, style)
+    _, guided = jax.jit(rooms.step)(key, kitchen.state, actions, style)
+    _, plain = jax.jit(reference.step)(key, kitchen.state, actions, style)
     assert np.asarray(guided.shaped_reward).tolist() == [2, 3]
     assert np.asarray(plain.shaped_reward).tolist() == [0, 3]
     assert float(guided.reward) == 0

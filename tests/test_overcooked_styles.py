@@ -322,9 +322,9 @@ def test_only_what_is_needed_is_worth_handing_over(kitchens, kitchen, name):
                     wanted = 1
                 else:
                     # Taking earns the opposite of putting: the taker of a gift earns 1.
-                    wanted = -1 if item in gives[1 - agent] else styles.JUNK_WORTH
+                    wanted = -1 if item in gives[1 - agent] else reward.IN_THE_WAY
                 assert worth[agent, counter, kind] == wanted, (x, y, agent, item)
-    assert styles.JUNK_WORTH < 0
+    assert reward.IN_THE_WAY < 0
 
 
 def test_nothing_is_handed_over_where_both_reach_everything(kitchens):

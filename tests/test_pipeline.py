@@ -1,0 +1,160 @@
+"""The whole method at toy size: a complete run, the commands on it, and interrupted runs."""
+
+import json
+import sys
+from pathlib import Path
+
+import numpy as np
+import pytest
+from PIL import Image
+
+from experiments import configs, devices, evaluate, evaluation, generate, training
+from experiments.pipeline import run_pipeline
+from experiments.stages import STAGES
+
+pytestmark = [pytest.mark.slow, pytest.mark.timeout(1500)]
+
+METHODS = {
+    evaluation.ORACLE,
+    evaluation.BEST_RESPONSE,
+    evaluation.RECONSTRUCTION,
+    evaluation.TRUE_LANGUAGE,
+    evaluation.TRAINING_SENTENCES,
+    evaluation.TEST_SENTENCES,
+    evaluation.WRONG_SENTENCE,
+}
+
+
+@pytest.fixture(scope="module")
+def results(smoke_run):
+    return json.loads((smoke_run / "results.json").read_text())
+
+
+def numbers(value) -> list[float]:
+    """All numbers in nested lists and objects."""
+    if isinstance(value, dict):
+        return [n for item in value.values() for n in numbers(item)]
+    if isinstance(value, list):
+        return [n for item in value for n in numbers(item)]
+    return [value] if isinstance(value, int | float) and not isinstance(value, bool) else []
+
+
+def test_results_hold_every_method_style_and_held_out_seed(results):
+    config = configs.smoke(configs.DEFAULT_ENVIRONMENT, 0).partners
+    styles = results["styles"]
+    assert len(styles) == 8
+    assert set(results["methods"]) == METHODS
+    for method, by_style in results["methods"].items():
+        assert list(by_style) == styles, method
+        for style, values in by_style.items():
+            assert len(values["returns"]) == config.held_out_seeds, (method, style)
+    assert list(results["oracle"]) == styles
+    assert np.shape(results["cross_play"]) == (8, 8)
+    assert set(results["times"]) == {*STAGES, "evaluation"}
+    assert np.shape(results["task_language"]["v_hat"]) == (
+        8,
+        len(results["task_language"]["events"]),
+    )
+    for style in styles:
+        assert len(results["partners"]["joint_returns"][style]) == config.num_seeds
+        curve = np.shape(results["curves"]["returns"][style])
+        assert curve == (config.num_seeds, len(results["curves"]["steps"]))
+    assert {"value", "bar", "met"} <= set(next(iter(results["gates"].values())))
+    assert np.isfinite(numbers(results)).all()
+
+
+def test_the_run_folder_is_complete(smoke_run, results):
+    for stage in (*STAGES, "evaluation", "report"):
+        assert (smoke_run / stage / "metrics.json").is_file(), stage
+    report = (smoke_run / "report.md").read_text()
+    assert results["styles"][0] in report.replace(" ", "_")
+    assert len(list((smoke_run / "figures").glob("*.png"))) >= 4
+    assert any((smoke_run / "tensorboard").iterdir())
+    assert (smoke_run / "log.jsonl").stat().st_size > 0
+    for style in results["styles"]:
+        with Image.open(smoke_run / "figures" / "episodes" / f"{style}.gif") as episode:
+            assert episode.n_frames > 1
+
+
+def run_command(monkeypatch, command, *arguments) -> None:
+    monkeypatch.setattr(devices, "prepare", lambda **_: None)
+    monkeypatch.setattr(sys, "argv", ["command", *map(str, arguments)])
+    with pytest.raises(SystemExit) as stopped:
+        command.main()
+    assert not stopped.value.code
+
+
+def test_evaluate_measures_sentences_of_ones_own(monkeypatch, capsys, smoke_run, tmp_path):
+    own, out = tmp_path / "mine.toml", tmp_path / "out.json"
+    own.write_text('left_no_onion = ["I cook on the left.", "Bring me onions."]')
+    arguments = (smoke_run, "--instructions", own, "--json", out, "--games", 4)
+    run_command(monkeypatch, evaluate, *arguments)
+    found = json.loads(out.read_text())
+    assert list(found["styles"]) == ["left_no_onion"]
+    sentences = found["styles"]["left_no_onion"]["sentences"]
+    assert [s["sentence"] for s in sentences] == ["I cook on the left.", "Bring me onions."]
+    assert "left_no_onion" in capsys.readouterr().out
+    first = out.read_bytes()
+    run_command(monkeypatch, evaluate, *arguments)
+    assert out.read_bytes() == first, "the same seed gives the same result"
+
+
+def test_generate_plays_an_episode_and_draws_it(monkeypatch, capsys, smoke_run, tmp_path):
+    gif = tmp_path / "episode.gif"
+    run_command(monkeypatch, generate, smoke_run, "I will cook on the left", "--gif", gif)
+    shown = capsys.readouterr().out
+    assert "I will cook on the left" in shown
+    assert "ms" in shown
+    with Image.open(gif) as episode:
+        assert episode.n_frames > 1
+
+
+class Killed(BaseException):
+    """Stands for a process that dies; not an Exception, so that nothing may catch it."""
+
+
+def run_until_killed(monkeypatch, config, path: Path, checkpoint_folder: str) -> None:
+    """Runs until the first checkpoint in the middle of a stage is written."""
+    original = training.Saver.save_if_due
+
+    def save_and_die(saver, state):
+        original(saver, state)
+        if saver.path.parts[-2:] == tuple(checkpoint_folder.split("/")):
+            raise Killed
+
+    with monkeypatch.context() as patched:
+        patched.setattr(training.Saver, "save_if_due", save_and_die)
+        with pytest.raises(Killed):
+            run_pipeline(config, path)
+    assert (path / checkpoint_folder / "manifest.json").is_file()
+    assert not (path / checkpoint_folder).parent.joinpath("metrics.json").exists()
+
+
+def lasting(results: dict) -> dict:
+    """The results without what differs between two runs of the same thing."""
+    kept = {k: v for k, v in results.items() if k not in ("times", "machine", "generation")}
+    return json.loads(json.dumps(kept))
+
+
+def test_a_run_killed_twice_ends_with_the_results_of_an_uninterrupted_one(
+    monkeypatch, smoke_run, tmp_path
+):
+    monkeypatch.setattr(training, "SECONDS_BETWEEN_CHECKPOINTS", 0.0)
+    monkeypatch.setattr(training, "UPDATES_PER_PIECE", 3)
+    config = configs.smoke(configs.DEFAULT_ENVIRONMENT, seed=0)
+    path = tmp_path / "interrupted"
+    run_until_killed(monkeypatch, config, path, "partners/unfinished")
+    run_until_killed(monkeypatch, config, path, "policy_vae/unfinished")
+    partners_done = (path / "partners" / "metrics.json").stat().st_mtime_ns
+    run_pipeline(config, path)
+    assert (path / "partners" / "metrics.json").stat().st_mtime_ns == partners_done
+    expected, found = (
+        lasting(json.loads((folder / "results.json").read_text())) for folder in (smoke_run, path)
+    )
+    assert found == expected
+    for stage in STAGES:
+        whole, resumed = (
+            set(json.loads((folder / stage / "metrics.json").read_text()))
+            for folder in (smoke_run, path)
+        )
+        assert resumed == whole, f"metrics of stage {stage}"
