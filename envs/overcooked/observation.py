@@ -109,22 +109,69 @@ def features(layout: Layout, state: State, agent: int, max_steps: int) -> jax.Ar
     return jnp.concatenate([part.astype(jnp.float32) for part in parts])
 
 
-@functools.cache
-def _terrain_masks(layout: Layout) -> np.ndarray:
-    """Where pots, counters, onions, tomatoes, dishes and serving cells are, [H, W, 6]."""
-    letters = np.array([list(row) for row in layout.terrain])
-    return np.stack([letters == kind for kind in "PXOTDS"], axis=-1)
+_CHANNEL = {name: index for index, name in enumerate(GRID_CHANNELS)}
 
 
 @functools.cache
-def _scatter_maps(layout: Layout) -> tuple[np.ndarray, np.ndarray]:
-    """Index of each grid cell's floor cell and station (one past the end for none), [H, W]."""
-    floor = np.full((layout.height, layout.width), len(layout.floor))
-    floor[layout.floor[:, 1], layout.floor[:, 0]] = np.arange(len(layout.floor))
-    station = np.full((layout.height, layout.width), len(layout.stations))
-    x, y = layout.stations.T
-    station[y, x] = np.arange(len(layout.stations))
-    return floor, station
+def _item_rows() -> np.ndarray:
+    """Channels of a cell where an item lies or is held, by item code, uint8 [17, 26]."""
+    rows = np.zeros((dynamics.SOUP + 13, len(GRID_CHANNELS)), np.uint8)
+    for item, name in ((dynamics.ONION, "onion"), (dynamics.TOMATO, "tomato")):
+        rows[item, _CHANNEL[name]] = 1
+    rows[dynamics.DISH, _CHANNEL["dish"]] = 1
+    content = np.arange(13)
+    # A soup off the stove counts as ready, with no time left.
+    rows[dynamics.SOUP :, _CHANNEL["soup_ready"]] = 1
+    rows[dynamics.SOUP :, _CHANNEL["onions_in_soup"]] = content >> 2
+    rows[dynamics.SOUP :, _CHANNEL["tomatoes_in_soup"]] = content & 3
+    return rows
+
+
+@functools.cache
+def _pot_rows(cook_time: int) -> np.ndarray:
+    """Channels of a pot by content and timer + 1, uint8 [13, cook_time + 2, 26]."""
+    rows = np.zeros((13, cook_time + 2, len(GRID_CHANNELS)), np.uint8)
+    for content in range(13):
+        onions, tomatoes = content >> 2, content & 3
+        rows[content, 0, [_CHANNEL["onions_in_pot"], _CHANNEL["tomatoes_in_pot"]]] = (
+            onions,
+            tomatoes,
+        )
+        rows[content, 1:, _CHANNEL["onions_in_soup"]] = onions
+        rows[content, 1:, _CHANNEL["tomatoes_in_soup"]] = tomatoes
+    rows[:, 1:, _CHANNEL["cooking_time_left"]] = cook_time - np.arange(cook_time + 1)
+    rows[:, -1, _CHANNEL["soup_ready"]] = 1
+    return rows
+
+
+@functools.cache
+def _terrain_rows(layout: Layout) -> np.ndarray:
+    """Where pots, counters, dispensers and serving cells are, uint8 [W * H, 26]; x-major."""
+    letters = np.array([list(row) for row in layout.terrain]).T.ravel()
+    rows = np.zeros((len(letters), len(GRID_CHANNELS)), np.uint8)
+    first = _CHANNEL["pot"]
+    rows[:, first : first + 6] = letters[:, None] == np.array(list("PXOTDS"))
+    return rows
+
+
+def _kitchen_rows(layout: Layout, state: State) -> jax.Array:
+    """The grid without players and urgency, the same for both players, uint8 [W * H, 26].
+
+    Cells whose channels can change are laid between runs of constant ones: on a CPU, one
+    concatenation is several times faster than computing every channel of every cell.
+    """
+    terrain = _terrain_rows(layout)
+    changing = layout.num_counters + layout.num_pots
+    positions = layout.stations[:changing] @ (layout.height, 1)
+    counters = jnp.asarray(_item_rows())[state.counters]
+    pots = jnp.asarray(_pot_rows(layout.cook_time))[state.pot_content, state.pot_timer + 1]
+    rows = jnp.concatenate([counters, pots]) | terrain[positions]
+    pieces, end = [], 0
+    for station in np.argsort(positions):
+        position = positions[station]
+        pieces += [terrain[end:position], rows[station][None]]
+        end = position + 1
+    return jnp.concatenate([*pieces, terrain[end:]])
 
 
 def grid(layout: Layout, state: State, agent: int, max_steps: int) -> jax.Array:
@@ -133,38 +180,21 @@ def grid(layout: Layout, state: State, agent: int, max_steps: int) -> jax.Array:
     Channels are named by `GRID_CHANNELS`; axes are (x, y) as in the reference, whose
     `lossless_state_encoding` of version 1.1.0 this follows.
     """
-    floor_map, station_map = _scatter_maps(layout)
-    other = 1 - agent
-    here = {player: floor_map == state.cell[player] for player in (0, 1)}
-    channels = [here[agent], here[other]]
-    channels += [
-        here[p] & (state.orientation[p] == direction)
-        for p in (agent, other)
-        for direction in range(4)
-    ]
-    channels += list(np.moveaxis(_terrain_masks(layout), -1, 0))
-
-    # Codes of the things on stations; pots carry their content, counters an item.
-    dispensers = len(layout.stations) - layout.num_counters - layout.num_pots + 1
-    none = jnp.zeros(dispensers, jnp.int32)
-    lying = jnp.concatenate([state.counters, jnp.zeros(layout.num_pots, jnp.int32), none])
-    held = sum(jnp.where(here[player], state.held[player], 0) for player in (0, 1))
-    item = lying[station_map] + held
-    in_soup = jnp.where(item >= dynamics.SOUP, item - dynamics.SOUP, 0)
-    no_counters = jnp.zeros(layout.num_counters, jnp.int32)
-    pot_content = jnp.concatenate([no_counters, state.pot_content, none])[station_map]
-    timer = jnp.concatenate([no_counters - 1, state.pot_timer, none - 1])[station_map]
-    started = timer >= 0
-    in_pot = jnp.where(started, 0, pot_content)
-    soup = in_soup + jnp.where(started, pot_content, 0)
-    # A soup off the stove counts as ready, with no time left.
-    channels += [in_pot >> 2, in_pot & 3, soup >> 2, soup & 3]
-    channels += [
-        jnp.where(started, layout.cook_time - timer, 0),
-        (timer == layout.cook_time) | (item >= dynamics.SOUP),
-    ]
-    channels += [item == code for code in (dynamics.DISH, dynamics.ONION, dynamics.TOMATO)]
+    channels = np.arange(len(GRID_CHANNELS))
+    encoded = _kitchen_rows(layout, state)
+    places = np.arange(layout.width * layout.height)
+    floor = jnp.asarray(layout.floor @ (layout.height, 1))
+    for player, location, orientation in (
+        (agent, "own_location", "own_orientation_north"),
+        (1 - agent, "other_location", "other_orientation_north"),
+    ):
+        here = places == floor[state.cell[player]]
+        row = (
+            jnp.asarray(_item_rows())[state.held[player]]
+            | (channels == _CHANNEL[location])
+            | (channels == _CHANNEL[orientation] + state.orientation[player])
+        )
+        encoded |= jnp.where(here[:, None], row, jnp.uint8(0))
     urgent = max_steps - state.time < URGENT_STEPS
-    channels.append(jnp.broadcast_to(urgent, floor_map.shape))
-    stacked = jnp.stack([jnp.asarray(c).astype(jnp.uint8) for c in channels], axis=-1)
-    return stacked.transpose(1, 0, 2)
+    encoded |= (urgent & (channels == _CHANNEL["urgency"])).astype(jnp.uint8)
+    return encoded.reshape(layout.width, layout.height, len(GRID_CHANNELS))
