@@ -5,7 +5,7 @@ from collections.abc import Callable
 
 from haland_jax.diffusion import DiffusionConfig
 from haland_jax.fit import FitConfig
-from haland_jax.partners import PartnersConfig
+from haland_jax.partners import PartnersConfig, refit_config
 from haland_jax.policy_vae import PolicyVAEConfig
 from haland_jax.ppo import PPOConfig
 from haland_jax.translator import TranslatorConfig
@@ -92,18 +92,6 @@ class RunConfig:
     evaluation: EvaluationConfig = dataclasses.field(default_factory=EvaluationConfig)
 
 
-def _refit(total_steps: int) -> PPOConfig:
-    return PPOConfig(
-        total_steps=total_steps,
-        learning_rate=3e-4,
-        entropy=0.01,
-        final_entropy=0.002,
-        shaping=0.0,
-        confined_until=0.0,
-        random_start=0.3,
-    )
-
-
 def smoke(environment: str, seed: int) -> RunConfig:
     """Every stage at toy size, to see that all of it works; nothing is learnt.
 
@@ -150,7 +138,7 @@ def smoke(environment: str, seed: int) -> RunConfig:
 
 
 def quick(environment: str, seed: int) -> RunConfig:
-    """The whole method with two training and two held-out seeds a style.
+    """The whole method with three training and two held-out seeds a style.
 
     `python -m experiments.run`; about a quarter of an hour on two CPU cores.
     """
@@ -159,15 +147,18 @@ def quick(environment: str, seed: int) -> RunConfig:
         preset="quick",
         seed=seed,
         partners=PartnersConfig(
-            train_seeds=2,
+            train_seeds=3,
             held_out_seeds=2,
             spare_seeds=0,
-            joint=PPOConfig(total_steps=900_000),
-            refit=_refit(200_000),
-            oracle=_refit(200_000),
+            joint=PPOConfig(total_steps=800_000),
+            refit=refit_config(300_000, num_envs=36, partner_noise=0.1),
+            oracle=refit_config(200_000),
             oracle_candidates=2,
         ),
-        diffusion=DiffusionConfig(clip=8.0),
+        compression=CompressionConfig(
+            fit=FitConfig(learning_rate=1e-2, steps=1500, warmup_steps=50)
+        ),
+        diffusion=DiffusionConfig(clip=8.0, frequency_jitter=0.08),
     )
 
 
@@ -186,6 +177,7 @@ def paper(environment: str, seed: int) -> RunConfig:
         ),
         diffusion=DiffusionConfig(
             clip=8.0,
+            frequency_jitter=0.08,
             fit=FitConfig(learning_rate=2e-3, steps=10_000, warmup_steps=200, ema_decay=0.999),
         ),
         evaluation=EvaluationConfig(games=32, samples=4),

@@ -29,6 +29,26 @@ from haland_jax.population import over_population, share_out
 from haland_jax.ppo import PPOConfig, TrainState
 
 
+def refit_config(total_steps: int, num_envs: int = 32, partner_noise: float = 0.0) -> PPOConfig:
+    """Returns settings for an ego that has learnt already: no shaping, little exploration.
+
+    Args:
+        total_steps: environment steps of one ego.
+        num_envs: games in parallel; a multiple of the partners that share them.
+        partner_noise: see `PPOConfig`.
+    """
+    return PPOConfig(
+        total_steps=total_steps,
+        num_envs=num_envs,
+        learning_rate=3e-4,
+        entropy=0.01,
+        shaping=0.0,
+        confined_until=0.0,
+        random_start=0.3,
+        partner_noise=partner_noise,
+    )
+
+
 @dataclasses.dataclass(frozen=True)
 class PartnersConfig:
     """How many partners, and how each stage trains.
@@ -49,25 +69,9 @@ class PartnersConfig:
     spare_seeds: int = 2
     joint: PPOConfig = dataclasses.field(default_factory=PPOConfig)
     refit: PPOConfig = dataclasses.field(
-        default_factory=lambda: PPOConfig(
-            total_steps=300_000,
-            learning_rate=3e-4,
-            entropy=0.01,
-            shaping=0.0,
-            confined_until=0.0,
-            random_start=0.3,
-        )
+        default_factory=lambda: refit_config(300_000, num_envs=40, partner_noise=0.1)
     )
-    oracle: PPOConfig = dataclasses.field(
-        default_factory=lambda: PPOConfig(
-            total_steps=300_000,
-            learning_rate=3e-4,
-            entropy=0.01,
-            shaping=0.0,
-            confined_until=0.0,
-            random_start=0.3,
-        )
-    )
+    oracle: PPOConfig = dataclasses.field(default_factory=lambda: refit_config(300_000))
     oracle_candidates: int = 3
     evaluation_games: int = 32
 
@@ -331,10 +335,12 @@ def visited_observations(
 ) -> jax.Array:
     """Returns observations of the ego in games with a partner, drawn at random, [num_kept, O].
 
-    Observations after a game's end are never drawn (where any game lasted long enough).
+    Half of the games go on from a random moment, so that the observations cover more than what
+    this one partner leads to. Observations after a game's end are never drawn.
     """
     game_key, draw_key = jax.random.split(key)
-    games = jax.vmap(lambda k: rollout.record(env, k, ego, partner, style))(
+    record = partial(rollout.record, env, random_share=0.5)
+    games = jax.vmap(lambda k: record(k, ego, partner, style))(
         jax.random.split(game_key, num_games)
     )
     observations = games.observations.ego.reshape(-1, games.observations.ego.shape[-1])

@@ -37,6 +37,8 @@ class PPOConfig:
         random_start: share of games that start at a random moment, at the start of training;
             it falls linearly to 0 at the end.
         random_start_until: progress up to which the share stays as it is.
+        partner_noise: chance that a frozen partner plays a random action instead of its own,
+            so that the ego meets more than the conventions of the partners it trains with.
     """
 
     total_steps: int = 1_000_000
@@ -59,6 +61,7 @@ class PPOConfig:
     confined_until: float = 0.55
     random_start: float = 0.9
     random_start_until: float = 0.5
+    partner_noise: float = 0.0
 
     def __post_init__(self):
         if self.num_envs % self.num_minibatches:

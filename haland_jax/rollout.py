@@ -103,10 +103,17 @@ def record(
     style: Any,
     *,
     greedy: bool = False,
+    random_share: float = 0.0,
 ) -> Recording:
-    """Plays one game of a pair and keeps every step; arguments as in `play`."""
+    """Plays one game of a pair and keeps every step; arguments as in `play`.
+
+    With chance `random_share` the game goes on from a random moment (`training_reset`).
+    """
     reset_key, play_key = jax.random.split(key)
-    state, timestep = env.reset(reset_key, style)
+    if random_share:
+        state, timestep = env.training_reset(reset_key, style, random_share)
+    else:
+        state, timestep = env.reset(reset_key, style)
 
     def one_step(carry, step_key):
         state, observation, alive = carry
