@@ -113,7 +113,7 @@ def test_a_run_of_another_version_is_refused(capsys, monkeypatch, tmp_path):
     for change, message in (
         ({"preset": "huge"}, "has the preset 'huge'; expected one of smoke"),
         ({"gone": 1}, "does not fit this version"),
-        ({"environment": None}, "does not fit this version|unknown environment"),
+        ({"environment": "overcooked/gone"}, "unknown environment"),
     ):
         (path / "config.json").write_text(json.dumps({**stored, **change}))
         line = refused(capsys, monkeypatch, generate, path, "I stay left")
