@@ -61,8 +61,12 @@ class Overcooked:
     def styles(self) -> Style:
         """All styles stacked, leading axis [style]."""
         rules = styles.style_rules(self.layout).values()
-        built = [styles.build_style(self.layout, rule, max_steps=self.max_steps) for rule in rules]
-        return jax.tree.map(lambda *leaves: jnp.stack(leaves), *built)
+        # The first use may be inside a compiled function, whose values must not be kept.
+        with jax.ensure_compile_time_eval():
+            built = [
+                styles.build_style(self.layout, rule, max_steps=self.max_steps) for rule in rules
+            ]
+            return jax.tree.map(lambda *leaves: jnp.stack(leaves), *built)
 
     def style(self, name: str) -> Style:
         """Returns one style; ValueError for an unknown name."""
