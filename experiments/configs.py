@@ -149,14 +149,14 @@ def quick(environment: str, seed: int) -> RunConfig:
         partners=PartnersConfig(
             train_seeds=3,
             held_out_seeds=2,
-            spare_seeds=0,
-            joint=PPOConfig(total_steps=800_000),
-            refit=refit_config(300_000, num_envs=36, partner_noise=0.1),
+            spare_seeds=1,
+            joint=PPOConfig(total_steps=900_000),
+            refit=refit_config(400_000, num_envs=36, partner_noise=0.1),
             oracle=refit_config(200_000),
             oracle_candidates=2,
         ),
         compression=CompressionConfig(
-            fit=FitConfig(learning_rate=1e-2, steps=1500, warmup_steps=50)
+            fit=FitConfig(learning_rate=1e-2, steps=1750, warmup_steps=50)
         ),
         diffusion=DiffusionConfig(clip=8.0, frequency_jitter=0.08),
     )
