@@ -162,14 +162,14 @@ def _kitchen_rows(layout: Layout, state: State) -> jax.Array:
     """
     terrain = _terrain_rows(layout)
     changing = layout.num_counters + layout.num_pots
-    positions = layout.stations[:changing] @ (layout.height, 1)
+    positions = layout.stations[:changing] @ np.array([layout.height, 1])
     counters = jnp.asarray(_item_rows())[state.counters]
     pots = jnp.asarray(_pot_rows(layout.cook_time))[state.pot_content, state.pot_timer + 1]
     rows = jnp.concatenate([counters, pots]) | terrain[positions]
     pieces, end = [], 0
     for station in np.argsort(positions):
         position = positions[station]
-        pieces += [terrain[end:position], rows[station][None]]
+        pieces += [terrain[end:position], rows[station, None]]
         end = position + 1
     return jnp.concatenate([*pieces, terrain[end:]])
 
@@ -183,7 +183,7 @@ def grid(layout: Layout, state: State, agent: int, max_steps: int) -> jax.Array:
     channels = np.arange(len(GRID_CHANNELS))
     encoded = _kitchen_rows(layout, state)
     places = np.arange(layout.width * layout.height)
-    floor = jnp.asarray(layout.floor @ (layout.height, 1))
+    floor = jnp.asarray(layout.floor @ np.array([layout.height, 1]))
     for player, location, orientation in (
         (agent, "own_location", "own_orientation_north"),
         (1 - agent, "other_location", "other_orientation_north"),

@@ -1,0 +1,286 @@
+"""How fast the environments and their training are on this machine.
+
+    python -m experiments.benchmark env                   Overcooked against JaxMARL's
+    python -m experiments.benchmark env --json out.json
+    python -m experiments.benchmark ppo                   training pairs of players
+
+Absolute figures drift with the machine's load; ratios of one run hold.
+"""
+
+import contextlib
+import dataclasses
+import functools
+import importlib.metadata
+import importlib.util
+import json
+import os
+import platform
+import time
+from pathlib import Path
+from typing import Annotated, Any
+
+import jax
+import numpy as np
+import tyro
+from rich.console import Console
+from rich.table import Table
+
+import envs
+from experiments import contenders, devices
+from experiments.configs import DEFAULT_ENVIRONMENT, PRESETS
+from experiments.contenders import PEER, PEER_PLAIN
+from experiments.errors import UserError, choose, main_guard
+
+KITCHENS = ("cramped_room", "counter_circuit")
+BARS = {"features": 5.0, "grid": 2.0}
+"""Times the speed of JaxMARL that each of our observations is expected to reach."""
+DESCRIPTION = "Measure how fast the environments and their training are on this machine."
+PPO_BAR = 80_000
+"""Environment steps per second expected of the training on two cores."""
+INSTALL_PEER = f"{PEER} is not installed; compare with it after: uv sync --group peers"
+
+
+@dataclasses.dataclass(frozen=True)
+class EnvArguments:
+    """Measure Overcooked with random actions, both players observed at every step.
+
+    Ours with the feature vector and with the grid, and JaxMARL's (where it is installed) take
+    turns in one process. Ours shares the games out over one device a core; JaxMARL gets the
+    better of one program on all cores and the same sharing out. "JaxMARL, our restart" leaves
+    out its reset at every step, as our loop does; the bars are set against JaxMARL as it is.
+    """
+
+    kitchens: tuple[str, ...] = KITCHENS
+    """Classic kitchens to measure."""
+    batch: int = 512
+    """Games played at once."""
+    steps: int = 1000
+    """Steps of each game in one repeat; games last 400 steps and start again."""
+    repeats: int = 5
+    """Repeats of each; the fastest counts."""
+    cores: int = 2
+    """Cores to use."""
+    json: Annotated[Path | None, tyro.conf.arg(metavar="OUT")] = None
+    """Write the result as JSON too."""
+
+
+@dataclasses.dataclass(frozen=True)
+class PpoArguments:
+    """Measure PPO with both players learning, all styles and four seeds in one program.
+
+    Settings are those of the preset `quick`; the time to compile is told apart.
+    """
+
+    env: Annotated[str, tyro.conf.arg(metavar="NAME")] = DEFAULT_ENVIRONMENT
+    """Environment with partner styles."""
+    updates: int = 4
+    """Updates of every pair in one repeat (1600 steps each)."""
+    repeats: int = 3
+    """Repeats; the fastest counts."""
+    cores: int | None = None
+    """Cores to use; all by default."""
+    json: Annotated[Path | None, tyro.conf.arg(metavar="OUT")] = None
+    """Write the result as JSON too."""
+
+
+Arguments = (
+    Annotated[EnvArguments, tyro.conf.subcommand("env")]
+    | Annotated[PpoArguments, tyro.conf.subcommand("ppo")]
+)
+
+
+def measure_kitchen(kitchen: str, batch: int, steps: int, repeats: int) -> dict[str, Any]:
+    """Steps per second of every contender in one kitchen.
+
+    Returns:
+        By contender: `steps_per_second`; for ours beside the peer also `ratio`, `bar`, `met`
+        and `ratio_to_our_restart`; for the peer the `configuration` that was the faster one.
+    """
+    peers = (PEER, PEER_PLAIN) if contenders.has_peer() else ()
+    entries = [(f"ours, {e}", contenders.our_games(kitchen, e), True) for e in BARS]
+    for name in peers:
+        contender = contenders.peer_games(kitchen, own_reset=name == PEER)
+        entries += [
+            (f"{name}: one program", contender, False),
+            (f"{name}: shared out", contender, True),
+        ]
+    programs = {
+        name: contenders.compile_games(contender, batch, steps, shared_out=shared_out)
+        for name, contender, shared_out in entries
+    }
+    seconds = contenders.fastest(programs, repeats)
+    speeds = {name: batch * steps / taken for name, taken in seconds.items()}
+    found: dict[str, Any] = {}
+    for name in peers:
+        best = max((n for n in speeds if n.startswith(f"{name}: ")), key=lambda n: speeds[n])
+        found[name] = {
+            "steps_per_second": speeds[best],
+            "configuration": best.removeprefix(f"{name}: "),
+        }
+    for encoding, bar in BARS.items():
+        speed = speeds[f"ours, {encoding}"]
+        row = found[f"ours, {encoding}"] = {"steps_per_second": speed}
+        if peers:
+            ratio = speed / found[PEER]["steps_per_second"]
+            plain = speed / found[PEER_PLAIN]["steps_per_second"]
+            row |= {"ratio": ratio, "bar": bar, "met": ratio >= bar, "ratio_to_our_restart": plain}
+    return found
+
+
+def measure_ppo(environment: str, updates: int, repeats: int, config: Any = None) -> dict[str, Any]:
+    """Steps per second of training pairs, and seconds to compile.
+
+    Args:
+        environment: name in the registry.
+        updates: updates of every pair in one repeat.
+        repeats: repeats; the fastest counts.
+        config: `PartnersConfig`; that of the preset `quick` by default.
+    """
+    from haland_jax import partners
+
+    env = envs.make(environment)
+    config = config or PRESETS["quick"](environment, 0).partners
+    state = partners.place(partners.init_pairs(env, config, jax.random.key(0)))
+    styles = partners.place(partners.repeat_styles(env, config.num_seeds))
+    begin = time.perf_counter()
+    train = partners.compile_training(env, config.joint, updates).lower(state, styles).compile()
+    compile_seconds = time.perf_counter() - begin
+    pairs = len(env.style_names) * config.num_seeds
+    best = float("inf")
+    for _ in range(repeats + 1):  # the first one warms up
+        begin = time.perf_counter()
+        state, metrics = jax.block_until_ready(train(state, styles))
+        best = min(best, time.perf_counter() - begin)
+    if not np.isfinite(metrics["loss"]).all():
+        raise FloatingPointError("the training's loss is not finite")
+    speed = pairs * updates * config.joint.steps_per_update / best
+    return {
+        "environment": environment,
+        "pairs": pairs,
+        "steps_per_second": speed,
+        "compile_seconds": compile_seconds,
+        "bar": PPO_BAR,
+        "met": speed >= PPO_BAR,
+    }
+
+
+def machine() -> dict[str, Any]:
+    """What the figures were measured on."""
+    processor = platform.processor() or platform.machine()
+    with contextlib.suppress(OSError):
+        lines = Path("/proc/cpuinfo").read_text().splitlines()
+        names = [line.split(":", 1)[1].strip() for line in lines if line.startswith("model name")]
+        processor = names[0] if names else processor
+    packages = ("jax", "jaxlib", *(("jaxmarl",) if contenders.has_peer() else ()))
+    return {
+        "processor": processor,
+        "devices": f"{len(jax.devices())} x {jax.devices()[0].device_kind}",
+        "python": platform.python_version(),
+        **{name: importlib.metadata.version(name) for name in packages},
+    }
+
+
+def _judged(met: bool) -> str:
+    return "[green]met[/]" if met else "[red]missed[/]"
+
+
+def env_table(found: dict[str, Any]) -> Table:
+    """The environment's speeds for the terminal."""
+    table = Table(
+        title=f"Overcooked, random actions, {found['batch']} games at once",
+        caption=", ".join(f"{name} {value}" for name, value in found["machine"].items()),
+    )
+    for column in ("kitchen", "engine"):
+        table.add_column(column)
+    for column in ("steps/s", f"x {PEER}", "bar", ""):
+        table.add_column(column, justify="right")
+    for kitchen, rows in found["kitchens"].items():
+        for name, row in rows.items():
+            note = f" ({row['configuration']})" if "configuration" in row else ""
+            judged = ()
+            if "ratio" in row:
+                judged = (f"{row['ratio']:.1f}", f">= {row['bar']:.0f}", _judged(row["met"]))
+            table.add_row(kitchen, name + note, f"{row['steps_per_second']:,.0f}", *judged)
+        table.add_section()
+    return table
+
+
+def ppo_table(found: dict[str, Any]) -> Table:
+    """The training's speed for the terminal."""
+    table = Table(
+        title=f"PPO, both players learning, {found['pairs']} pairs, {found['environment']}",
+        caption=", ".join(f"{name} {value}" for name, value in found["machine"].items()),
+    )
+    for column in ("steps/s", "bar", "", "compilation"):
+        table.add_column(column, justify="right")
+    table.add_row(
+        f"{found['steps_per_second']:,.0f}",
+        f">= {found['bar']:,}",
+        _judged(found["met"]),
+        f"{found['compile_seconds']:.1f} s",
+    )
+    return table
+
+
+def _prepare(cores: int | None) -> None:
+    """Holds the process, and so every contender, to some cores; compiles anew."""
+    if cores is not None and hasattr(os, "sched_setaffinity"):
+        usable = sorted(os.sched_getaffinity(0))
+        if len(usable) < cores:
+            raise UserError(f"cores is {cores}; expected at most {len(usable)} on this machine")
+        os.sched_setaffinity(0, usable[:cores])
+    devices.prepare(cores=cores)
+    jax.config.update("jax_enable_compilation_cache", False)
+
+
+def _check(arguments: EnvArguments | PpoArguments) -> None:
+    for field in dataclasses.fields(arguments):
+        value = getattr(arguments, field.name)
+        if isinstance(value, int) and value < 1:
+            raise UserError(f"{field.name} is {value}; expected at least 1")
+    if arguments.json is not None and not arguments.json.absolute().parent.is_dir():
+        raise UserError(f"the folder of {arguments.json} does not exist; make it first")
+    if isinstance(arguments, PpoArguments):
+        choose("environment", arguments.env, envs.names(styled_only=True))
+        return
+    for kitchen in arguments.kitchens:
+        choose("kitchen", kitchen, KITCHENS)
+    if arguments.batch % arguments.cores:
+        raise UserError(
+            f"batch is {arguments.batch}; expected a multiple of cores = {arguments.cores}"
+        )
+
+
+@main_guard
+def main() -> None:
+    """The command."""
+    arguments = tyro.cli(Arguments, prog="python -m experiments.benchmark", description=DESCRIPTION)
+    _check(arguments)
+    _prepare(arguments.cores)
+    console = Console()
+    if isinstance(arguments, PpoArguments):
+        found = measure_ppo(arguments.env, arguments.updates, arguments.repeats)
+        found["machine"] = machine()
+        console.print(ppo_table(found))
+    else:
+        measure = functools.partial(
+            measure_kitchen,
+            batch=arguments.batch,
+            steps=arguments.steps,
+            repeats=arguments.repeats,
+        )
+        found = {
+            "batch": arguments.batch,
+            "steps": arguments.steps,
+            "kitchens": {kitchen: measure(kitchen) for kitchen in arguments.kitchens},
+            "machine": machine(),
+        }
+        console.print(env_table(found))
+        if not contenders.has_peer():
+            console.print(INSTALL_PEER, highlight=False)
+    if arguments.json is not None:
+        arguments.json.write_text(json.dumps(found, indent=1) + "\n", encoding="utf-8")
+
+
+if __name__ == "__main__":
+    main()
