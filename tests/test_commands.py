@@ -4,7 +4,6 @@ import dataclasses
 import json
 import os
 import re
-import shutil
 import subprocess
 import sys
 from pathlib import Path
@@ -197,60 +196,6 @@ def test_the_real_command_also_ends_with_one_line_and_status_two(tmp_path):
     assert done.stderr.startswith("error: unknown preset 'fast'")
     assert done.stderr.count("\n") == 1
     assert not (tmp_path / "new").exists()
-
-
-# With a finished run.
-
-
-@pytest.fixture
-def copied_run(smoke_run, tmp_path):
-    """A copy of the smoke run that a test may damage."""
-    return Path(shutil.copytree(smoke_run, tmp_path / "copy"))
-
-
-@pytest.mark.slow
-def test_a_sentence_must_hold_words_and_not_too_many(capsys, monkeypatch, smoke_run):
-    for sentence, message in (("  ", "blank"), ("onion " * 60, "32")):
-        line = refused(capsys, monkeypatch, generate, smoke_run, sentence)
-        assert message in line
-
-
-@pytest.mark.slow
-def test_an_unknown_style_is_refused_with_a_suggestion(capsys, monkeypatch, smoke_run):
-    line = refused(capsys, monkeypatch, generate, smoke_run, "I cook", "--style", "left_no_oninon")
-    assert "did you mean 'left_no_onion'?" in line
-
-
-@pytest.mark.slow
-@pytest.mark.parametrize("command", [evaluate, generate])
-def test_one_flipped_byte_in_a_checkpoint_is_found(capsys, monkeypatch, copied_run, command):
-    arrays = copied_run / "translator" / "model" / "arrays"
-    file = max((f for f in arrays.rglob("*") if f.is_file()), key=lambda f: f.stat().st_size)
-    content = bytearray(file.read_bytes())
-    content[len(content) // 2] ^= 1
-    file.write_bytes(content)
-    sentence = ("I stay left",) if command is generate else ("--json", "out.json")
-    line = refused(capsys, monkeypatch, command, copied_run, *sentence)
-    assert "is damaged" in line
-    assert file.name in line
-    assert not Path("out.json").exists()
-
-
-@pytest.mark.slow
-def test_missing_encoder_weights_are_named(capsys, monkeypatch, copied_run):
-    stored = json.loads((copied_run / "config.json").read_text())
-    stored["encoder"] = str(copied_run / "no_such_bert")
-    (copied_run / "config.json").write_text(json.dumps(stored))
-    line = refused(capsys, monkeypatch, generate, copied_run, "I stay left")
-    assert "no_such_bert" in line
-
-
-@pytest.mark.slow
-def test_a_finished_run_is_not_continued_with_another_seed(capsys, monkeypatch, smoke_run):
-    before = {f: f.stat().st_mtime_ns for f in smoke_run.rglob("*.json")}
-    line = refused(capsys, monkeypatch, run, "--preset", "smoke", "--seed", 1, "--out", smoke_run)
-    assert "made with seed = 0, but 1 is asked for" in line
-    assert {f: f.stat().st_mtime_ns for f in smoke_run.rglob("*.json")} == before
 
 
 def test_presets_are_complete_and_differ():

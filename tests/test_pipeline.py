@@ -1,14 +1,19 @@
-"""The whole method at toy size: a complete run, the commands on it, and interrupted runs."""
+"""The whole method at toy size: a complete run, the commands on it, and interrupted runs.
+
+All that needs the finished run is in this file, so that one process makes it once.
+"""
 
 import json
+import shutil
 import sys
 from pathlib import Path
 
 import numpy as np
 import pytest
 from PIL import Image
+from test_commands import refused
 
-from experiments import configs, devices, evaluate, evaluation, generate, training
+from experiments import configs, devices, evaluate, evaluation, generate, run, training
 from experiments.pipeline import run_pipeline
 from experiments.stages import STAGES
 
@@ -77,7 +82,6 @@ def test_the_run_folder_is_complete(smoke_run, results):
 
 
 def run_command(monkeypatch, command, *arguments) -> None:
-    monkeypatch.setattr(devices, "prepare", lambda **_: None)
     monkeypatch.setattr(sys, "argv", ["command", *map(str, arguments)])
     with pytest.raises(SystemExit) as stopped:
         command.main()
@@ -107,6 +111,59 @@ def test_generate_plays_an_episode_and_draws_it(monkeypatch, capsys, smoke_run, 
     assert "ms" in shown
     with Image.open(gif) as episode:
         assert episode.n_frames > 1
+
+
+@pytest.fixture(autouse=True)
+def in_this_process(monkeypatch, tmp_path):
+    """The commands run in the tests' process, whose devices and cache are set already."""
+    monkeypatch.setattr(devices, "prepare", lambda **_: None)
+    monkeypatch.chdir(tmp_path)
+
+
+@pytest.fixture
+def copied_run(smoke_run, tmp_path):
+    """A copy of the smoke run that a test may damage."""
+    return Path(shutil.copytree(smoke_run, tmp_path / "copy"))
+
+
+def test_a_sentence_must_hold_words_and_not_too_many(capsys, monkeypatch, smoke_run):
+    for sentence, message in (("  ", "blank"), ("onion " * 60, "32")):
+        line = refused(capsys, monkeypatch, generate, smoke_run, sentence)
+        assert message in line
+
+
+def test_an_unknown_style_is_refused_with_a_suggestion(capsys, monkeypatch, smoke_run):
+    line = refused(capsys, monkeypatch, generate, smoke_run, "I cook", "--style", "left_no_oninon")
+    assert "did you mean 'left_no_onion'?" in line
+
+
+@pytest.mark.parametrize("command", [evaluate, generate])
+def test_one_flipped_byte_in_a_checkpoint_is_found(capsys, monkeypatch, copied_run, command):
+    arrays = copied_run / "translator" / "model" / "arrays"
+    file = max((f for f in arrays.rglob("*") if f.is_file()), key=lambda f: f.stat().st_size)
+    content = bytearray(file.read_bytes())
+    content[len(content) // 2] ^= 1
+    file.write_bytes(content)
+    sentence = ("I stay left",) if command is generate else ("--json", "out.json")
+    line = refused(capsys, monkeypatch, command, copied_run, *sentence)
+    assert "is damaged" in line
+    assert file.name in line
+    assert not Path("out.json").exists()
+
+
+def test_missing_encoder_weights_are_named(capsys, monkeypatch, copied_run):
+    stored = json.loads((copied_run / "config.json").read_text())
+    stored["encoder"] = str(copied_run / "no_such_bert")
+    (copied_run / "config.json").write_text(json.dumps(stored))
+    line = refused(capsys, monkeypatch, generate, copied_run, "I stay left")
+    assert "no_such_bert" in line
+
+
+def test_a_finished_run_is_not_continued_with_another_seed(capsys, monkeypatch, smoke_run):
+    before = {f: f.stat().st_mtime_ns for f in smoke_run.rglob("*.json")}
+    line = refused(capsys, monkeypatch, run, "--preset", "smoke", "--seed", 1, "--out", smoke_run)
+    assert "made with seed = 0, but 1 is asked for" in line
+    assert {f: f.stat().st_mtime_ns for f in smoke_run.rglob("*.json")} == before
 
 
 class Killed(BaseException):
