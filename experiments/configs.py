@@ -156,7 +156,7 @@ def quick(environment: str, seed: int) -> RunConfig:
             oracle_candidates=2,
         ),
         compression=CompressionConfig(
-            fit=FitConfig(learning_rate=1e-2, steps=1750, warmup_steps=50)
+            fit=FitConfig(learning_rate=1e-2, steps=1500, warmup_steps=50)
         ),
         diffusion=DiffusionConfig(clip=8.0, frequency_jitter=0.08),
     )

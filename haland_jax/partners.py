@@ -45,6 +45,7 @@ def refit_config(total_steps: int, num_envs: int = 32, partner_noise: float = 0.
         shaping=0.0,
         confined_until=0.0,
         random_start=0.3,
+        final_random_start=0.3,
         partner_noise=partner_noise,
     )
 

@@ -133,7 +133,9 @@ def _update(
     bound = progress < config.confined_until
     style_now = jax.tree.map(lambda held, free: jnp.where(bound, held, free), confined, style)
     remaining = (1 - progress) / (1 - config.random_start_until)
-    random_share = config.random_start * jnp.minimum(1.0, remaining)
+    random_share = config.final_random_start + jnp.minimum(1.0, remaining) * (
+        config.random_start - config.final_random_start
+    )
     state, steps = _rollout(env, config, state, style_now, rollout_key, random_share)
 
     actors, critic = make_networks(env)

@@ -35,8 +35,10 @@ class PPOConfig:
         shaping_until: progress, 0 to 1, at which the shaped reward has gone.
         confined_until: progress up to which the ego is held to its role.
         random_start: share of games that start at a random moment, at the start of training;
-            it falls linearly to 0 at the end.
+            it falls linearly to `final_random_start` at the end.
         random_start_until: progress up to which the share stays as it is.
+        final_random_start: see `random_start`. Some random moments to the end keep both players
+            from conventions that only the two of them share.
         partner_noise: chance that a frozen partner plays a random action instead of its own,
             so that the ego meets more than the conventions of the partners it trains with.
     """
@@ -61,6 +63,7 @@ class PPOConfig:
     confined_until: float = 0.55
     random_start: float = 0.9
     random_start_until: float = 0.5
+    final_random_start: float = 0.4
     partner_noise: float = 0.0
 
     def __post_init__(self):
