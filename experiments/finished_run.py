@@ -5,7 +5,7 @@ from pathlib import Path
 from typing import Any
 
 from experiments.configs import PRESETS, RunConfig
-from experiments.errors import UserError
+from experiments.errors import UserError, as_user_error
 from experiments.run_folder import RunFolder, to_json
 from experiments.stages import STAGES, Run
 
@@ -20,7 +20,8 @@ def open_run(path: Path) -> Run:
         UserError: there is no finished run, or it was made by another version's preset.
     """
     folder = RunFolder.read(path, tuple(STAGES))
-    return Run(_configuration(path, folder.configuration), folder)
+    with as_user_error():
+        return Run(_configuration(path, folder.configuration), folder)
 
 
 def _configuration(path: Path, stored: dict[str, Any]) -> RunConfig:

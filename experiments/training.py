@@ -4,7 +4,6 @@ Between two pieces the state may be saved; what is computed does not depend on w
 happens, so a resumed run ends with the results of an uninterrupted one.
 """
 
-import math
 import time
 from collections.abc import Callable
 from pathlib import Path
@@ -101,7 +100,7 @@ def run_fit(
     *,
     offset: int = 0,
     refresh: Callable[[FitState, Any], Any] | None = None,
-) -> tuple[FitState, dict[str, np.ndarray]]:
+) -> tuple[FitState, dict[str, float]]:
     """Runs a supervised fit to its end.
 
     Args:
@@ -116,12 +115,12 @@ def run_fit(
         refresh: makes the next piece's data from the state (and the data so far).
 
     Returns:
-        The final state, and the metrics of every chunk (means), [chunk].
+        The final state, and the last chunk's metrics (means).
 
     Raises:
         NonFiniteLoss: the fit diverged.
     """
-    history: list[dict[str, float]] = []
+    means: dict[str, float] = {}
     saved = saver.restore({"state": state, "data": data})
     if saved is not None:
         state, data = saved["state"], saved["data"]
@@ -130,15 +129,9 @@ def run_fit(
         state, metrics = chunk(state, data)
         fit.check_finite(stage, first, metrics)
         means = {name: float(np.mean(values)) for name, values in metrics.items()}
-        history.append(means)
         task.update(offset + int(state.step), means)
-        if refresh is not None and int(state.step) < config.steps:
-            data = refresh(state, data)
-        saver.save_if_due({"state": state, "data": data})
-    names = history[0] if history else {}
-    return state, {name: np.array([m[name] for m in history]) for name in names}
-
-
-def largest_divisor(number: int, at_most: int) -> int:
-    """The largest divisor of a number that is not above a bound."""
-    return max(math.gcd(number, candidate) for candidate in range(1, at_most + 1))
+        # Nothing is saved after the last piece, so that its metrics are always at hand.
+        if int(state.step) < config.steps:
+            data = refresh(state, data) if refresh is not None else data
+            saver.save_if_due({"state": state, "data": data})
+    return state, means

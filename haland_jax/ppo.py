@@ -114,7 +114,8 @@ def train_chunk(
 
     Returns:
         The new state, and metrics of each update, float32 [num_updates]: `reward`, team
-        reward a step; `shaped`, the mean shaped reward a step; `loss`, the ego's mean loss.
+        reward a step; `shaped`, the mean shaped reward a step; `loss`, the
+        mean loss of those who learn.
     """
 
     def one_update(state: TrainState, _: None):

@@ -59,8 +59,3 @@ def test_a_population_goes_on_where_it_was_and_ends_alike(monkeypatch, tmp_path)
         strict=True,
     ):
         np.testing.assert_allclose(one, two, rtol=1e-5, atol=1e-6)
-
-
-def test_the_largest_divisor():
-    assert [training.largest_divisor(12, n) for n in (1, 5, 6, 11, 12)] == [1, 4, 6, 6, 12]
-    assert training.largest_divisor(7, 6) == 1

@@ -7,6 +7,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
+from experiments.errors import as_user_error
 from experiments.progress import StageProgress
 from experiments.stages.context import Run
 from experiments.stages.population import load_archive, load_population, load_task_language
@@ -65,7 +66,7 @@ def fit_policy_vae(run: Run, task: StageProgress) -> dict[str, Any]:
         config.fit,
         config.chunk_steps,
     )
-    state, history = run_fit(
+    state, metrics = run_fit(
         "policy VAE",
         config.fit,
         chunk,
@@ -80,7 +81,7 @@ def fit_policy_vae(run: Run, task: StageProgress) -> dict[str, Any]:
         run.path("policy_vae", "vae"),
         {"params": state.params, "mean": posterior.mean, "log_variance": posterior.log_variance},
     )
-    return {name: values[-1] for name, values in history.items()}
+    return metrics
 
 
 def init_vae(run: Run, key: jax.Array, policies: Policy) -> tuple[PolicyVAE, Any]:
@@ -146,7 +147,7 @@ def fit_diffusion(run: Run, task: StageProgress) -> dict[str, Any]:
         config.fit,
         max(1, config.fit.steps // 20),
     )
-    state, history = run_fit(
+    state, metrics = run_fit(
         "diffusion",
         config.fit,
         chunk,
@@ -156,7 +157,7 @@ def fit_diffusion(run: Run, task: StageProgress) -> dict[str, Any]:
         task,
     )
     checkpoint.save(run.path("diffusion", "model"), DiffusionParams(state.ema, statistics))
-    return {name: values[-1] for name, values in history.items()}
+    return metrics
 
 
 def load_diffusion(run: Run) -> DiffusionParams:
@@ -168,12 +169,22 @@ def load_diffusion(run: Run) -> DiffusionParams:
     return checkpoint.restore(run.path("diffusion", "model"), DiffusionParams(network, statistics))
 
 
+def load_pretrained(run: Run) -> tuple[bert_weights.Encoder, Any]:
+    """The run's pre-trained encoder and its tokenizer.
+
+    Raises:
+        UserError: they are missing or do not fit.
+    """
+    source = run.config.encoder or None
+    with as_user_error(bert_weights.EncoderWeightsError):
+        return bert_weights.load_encoder(source), bert_weights.load_tokenizer(source)
+
+
 def fit_translator(run: Run, task: StageProgress) -> dict[str, Any]:
     """Stage 5: fine-tunes BERT on the training sentences, then fits the translation."""
     config = run.config.translator
     language = load_task_language(run)
-    encoder = bert_weights.load_encoder(run.config.encoder or None)
-    tokenizer = bert_weights.load_tokenizer(run.config.encoder or None)
+    encoder, tokenizer = load_pretrained(run)
     instructions = run.instructions()
     sentences = [s for style in instructions.values() for s in style.train]
     labels = [i for i, style in enumerate(instructions.values()) for _ in style.train]
@@ -215,7 +226,7 @@ def _fit_part(run, task, name, config, functions, params, key, data, *, offset):
     """One of the translator's two fits."""
     loss_fn, sample_fn = functions
     chunk = fit.make_fit_chunk(loss_fn, sample_fn, config, max(1, config.steps // 10))
-    state, history = run_fit(
+    state, metrics = run_fit(
         f"translator ({name})",
         config,
         chunk,
@@ -225,14 +236,14 @@ def _fit_part(run, task, name, config, functions, params, key, data, *, offset):
         task,
         offset=offset,
     )
-    return state.params, {metric: values[-1] for metric, values in history.items()}
+    return state.params, metrics
 
 
 def load_haland(run: Run) -> Haland:
     """Everything that a sentence needs to become a policy."""
     config = run.config.translator
     language = load_task_language(run)
-    encoder = bert_weights.load_encoder(run.config.encoder or None)
+    encoder, tokenizer = load_pretrained(run)
     fine_tuned = translator.init_fine_tuning(
         jax.random.key(0), encoder, config, len(run.env.style_names)
     )
@@ -251,7 +262,7 @@ def load_haland(run: Run) -> Haland:
         translator=translator.assemble_translator(
             encoder, config, saved["fine_tuned"], saved["vae"]
         ),
-        tokenizer=bert_weights.load_tokenizer(run.config.encoder or None),
+        tokenizer=tokenizer,
         style_names=run.env.style_names,
         v_hat=language.v_hat,
     )
