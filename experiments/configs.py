@@ -162,6 +162,37 @@ def quick(environment: str, seed: int) -> RunConfig:
     )
 
 
+def overnight(environment: str, seed: int) -> RunConfig:
+    """The scale of the recorded results: three training and three held-out seeds a style.
+
+    `python -m experiments.run --preset overnight --env all`; about three quarters of an hour
+    for each environment on two CPU cores.
+    """
+    return RunConfig(
+        environment=environment,
+        preset="overnight",
+        seed=seed,
+        partners=PartnersConfig(
+            train_seeds=3,
+            held_out_seeds=3,
+            spare_seeds=2,
+            joint=PPOConfig(total_steps=1_500_000),
+            refit=refit_config(600_000, num_envs=36, partner_noise=0.1),
+            oracle=refit_config(300_000),
+            oracle_candidates=2,
+        ),
+        compression=CompressionConfig(
+            fit=FitConfig(learning_rate=1e-2, steps=3000, warmup_steps=100)
+        ),
+        diffusion=DiffusionConfig(
+            clip=8.0,
+            frequency_jitter=0.08,
+            fit=FitConfig(learning_rate=2e-3, steps=4000, warmup_steps=200, ema_decay=0.999),
+        ),
+        evaluation=EvaluationConfig(games=32),
+    )
+
+
 def paper(environment: str, seed: int) -> RunConfig:
     """The scale of App. C to E: five training and five held-out seeds a style.
 
@@ -187,5 +218,6 @@ def paper(environment: str, seed: int) -> RunConfig:
 PRESETS: dict[str, Callable[[str, int], RunConfig]] = {
     "smoke": smoke,
     "quick": quick,
+    "overnight": overnight,
     "paper": paper,
 }
