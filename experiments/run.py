@@ -33,7 +33,8 @@ class Arguments:
     overcooked/diverse_coordination or overcooked/diverse_orders."""
     preset: Annotated[str, tyro.conf.arg(metavar="NAME")] = "quick"
     """Scale: smoke (two minutes, learns nothing), quick (a quarter of an hour on two cores),
-    overnight (three training and three held-out seeds a style), paper (five training and five held-out seeds a style; hours)."""
+    overnight (three training and three held-out seeds a style; three quarters of an hour),
+    paper (five and five; hours)."""
     seed: int = 0
     """Seed of all randomness; the same seed gives the same results."""
     out: Annotated[Path | None, tyro.conf.arg(metavar="FOLDER")] = None
