@@ -5,7 +5,7 @@ Functions are unbatched: callers `vmap` over games, styles and seeds. Nothing re
 itself, so a terminal observation is never mixed up with the first one of the next game.
 """
 
-from typing import Any, NamedTuple, Protocol
+from typing import Any, Literal, NamedTuple, Protocol
 
 import jax
 from flax.struct import PyTreeNode
@@ -57,6 +57,9 @@ class Environment(Protocol):
     num_actions: Pair
     observation_sizes: Pair
     max_steps: int
+    task_language_source: Literal["events", "labels"]
+    """What the task language is made of: frequencies of events (Eq. 8), or encodings of the
+    style's label where events do not tell the styles apart (App. D)."""
 
     def style(self, name: str) -> Any:
         """Returns one style. Raises ValueError for an unknown name."""

@@ -2,7 +2,7 @@
 
 import dataclasses
 import functools
-from typing import Literal
+from typing import ClassVar, Literal
 
 import jax
 import jax.numpy as jnp
@@ -34,6 +34,7 @@ class Overcooked:
     encoding: Literal["features", "grid"] = "features"
     shaping: Literal["guided", "reference"] = "guided"
     weights: ShapingWeights = dataclasses.field(default_factory=ShapingWeights)
+    task_language_source: ClassVar[Literal["events", "labels"]] = "events"
 
     def __post_init__(self):
         for name, options in (

@@ -153,7 +153,23 @@ def load_archive(run: Run) -> Archive:
 
 
 def make_task_language(run: Run, task: StageProgress) -> dict[str, Any]:
-    """Stage 2: counts events in games of the best responses with their training partners."""
+    """Stage 2: what tells the styles apart, as frequencies of events or as labels."""
+    times = run.config.partners.train_seeds
+    if run.env.task_language_source == "labels":
+        language = task_language.build_label_language(len(run.env.style_names), times)
+    else:
+        language = _count_events(run)
+    task.update(1)
+    checkpoint.save(
+        run.path("task_language", "language"),
+        {"v_hat": language.v_hat, "by_seed": language.v_hat_by_seed, "scale": language.scale},
+        {"events": list(language.event_names), "dropped": list(language.dropped_event_names)},
+    )
+    return {"events": len(language.event_names), "dropped": len(language.dropped_event_names)}
+
+
+def _count_events(run: Run) -> TaskLanguage:
+    """Counts events in games of the best responses with their training partners."""
     env, games = run.env, run.config.task_language_games
     population, archive = load_population(run), load_archive(run)
     times = run.config.partners.train_seeds
@@ -165,19 +181,12 @@ def make_task_language(run: Run, task: StageProgress) -> dict[str, Any]:
         partners.flatten(population.train_partners),
         partners.repeat_styles(env, times),
     )
-    task.update(1)
     counts = partners.unflatten(played.events, len(env.style_names))
     lengths = partners.unflatten(played.lengths, len(env.style_names))
     names = task_language.agent_event_names(env.event_names, envs.AGENTS)
-    language = task_language.build_task_language(
+    return task_language.build_task_language(
         task_language.event_frequencies(counts, lengths), names
     )
-    checkpoint.save(
-        run.path("task_language", "language"),
-        {"v_hat": language.v_hat, "by_seed": language.v_hat_by_seed, "scale": language.scale},
-        {"events": list(language.event_names), "dropped": list(language.dropped_event_names)},
-    )
-    return {"events": len(language.event_names), "dropped": len(language.dropped_event_names)}
 
 
 def load_task_language(run: Run) -> TaskLanguage:
