@@ -23,6 +23,7 @@ from rich.table import Table
 
 from experiments import devices
 from experiments.errors import UserError, as_user_error, choose, main_guard
+from experiments.summary import mean, shares
 
 
 @dataclasses.dataclass(frozen=True)
@@ -71,7 +72,7 @@ def read_sentences(path: Path, style_names: tuple[str, ...]) -> dict[str, list[s
 
 def measure(run: Any, sentences: dict[str, list[str]], games: int, seed: int) -> dict[str, Any]:
     """Plays one policy a sentence with every held-out partner of the sentence's style."""
-    from experiments.evaluation import Judge
+    from experiments.judge import Judge
     from experiments.stages import load_archive, load_haland, load_population
 
     haland, population, archive = load_haland(run), load_population(run), load_archive(run)
@@ -104,13 +105,12 @@ def measure(run: Any, sentences: dict[str, list[str]], games: int, seed: int) ->
     for style in sentences:
         index = env.style_names.index(style)
         mine = np.array([i for i, (of, _) in enumerate(rows) if of == index])
-        usable = oracle[mine].mean(axis=0) > 0
-        ratio = returns[mine].mean(axis=0)[usable] / oracle[mine].mean(axis=0)[usable]
+        share = mean(shares(returns[mine].mean(axis=0), oracle[mine].mean(axis=0)))
         found[style] = {
             "accuracy": float((nearest[mine] == index).mean()),
             "return": float(returns[mine].mean()),
             "oracle": float(oracle[mine].mean()),
-            "share_of_oracle": float(ratio.mean()) if usable.any() else None,
+            "share_of_oracle": None if np.isnan(share) else share,
             "sentences": [
                 {
                     "sentence": rows[i][1],
@@ -120,7 +120,7 @@ def measure(run: Any, sentences: dict[str, list[str]], games: int, seed: int) ->
                 for i in mine
             ],
         }
-    shares = [f["share_of_oracle"] for f in found.values() if f["share_of_oracle"] is not None]
+    measured = [f["share_of_oracle"] for f in found.values() if f["share_of_oracle"] is not None]
     return {
         "environment": run.config.environment,
         "games": games,
@@ -128,7 +128,7 @@ def measure(run: Any, sentences: dict[str, list[str]], games: int, seed: int) ->
         "mean": {
             "accuracy": float(np.mean([f["accuracy"] for f in found.values()])),
             "return": float(np.mean([f["return"] for f in found.values()])),
-            "share_of_oracle": float(np.mean(shares)) if shares else None,
+            "share_of_oracle": float(np.mean(measured)) if measured else None,
         },
     }
 

@@ -5,13 +5,15 @@ given by style and held-out seed, so that any statistic can be computed later.
 """
 
 import time
-from collections.abc import Mapping, Sequence
+from collections.abc import Sequence
 from typing import Any
 
 import jax
 import jax.numpy as jnp
 import numpy as np
 
+from experiments.gates import gates, policy_vae_gate
+from experiments.judge import Judge
 from experiments.progress import StageProgress
 from experiments.stages import (
     Run,
@@ -21,98 +23,16 @@ from experiments.stages import (
     load_task_language,
     load_vae,
 )
+from experiments.summary import BEST_RESPONSE, ORACLE
+from experiments.summary import HEADLINE as TEST_SENTENCES
+from experiments.summary import WRONG as WRONG_SENTENCE
 from haland_jax import partners, policy_vae
 from haland_jax.deployment import Haland
 from haland_jax.networks import Policy
 
-ORACLE, BEST_RESPONSE, RECONSTRUCTION = "Oracle", "Best response", "VAE reconstruction"
+RECONSTRUCTION = "VAE reconstruction"
 TRUE_LANGUAGE = "Diffusion, true task language"
 TRAINING_SENTENCES = "Haland, training sentences"
-TEST_SENTENCES, WRONG_SENTENCE = "Haland, test sentences", "Haland, wrong sentence"
-GATE_PERTURBATION = 0.1
-
-
-class Judge:
-    """Plays policies with partners, many pairs at a time in one compiled program."""
-
-    def __init__(self, env: Any, games: int, batch: int):
-        self.env, self.batch = env, batch
-        self._play = partners.compile_evaluation(env, games)
-
-    def returns(self, key: jax.Array, egos: Policy, partner: Policy, styles: Any) -> np.ndarray:
-        """Mean return of each pair; all arguments but the key have the leading axis [pair]."""
-        total = jax.tree.leaves(styles)[0].shape[0]
-        keys = jax.random.split(key, total)
-        means = []
-        for first in range(0, total, self.batch):
-            rows = np.minimum(np.arange(first, first + self.batch), total - 1)
-            pairs = _rows((egos, partner, styles), rows)
-            played = self._play(keys[rows], *pairs)
-            means.append(np.asarray(played.returns.mean(axis=1)))
-        return np.concatenate(means)[:total]
-
-    def with_held_out(self, key: jax.Array, egos: Policy, held_out: Policy) -> np.ndarray:
-        """Mean return of each style's egos with each held-out partner of that style.
-
-        Args:
-            key: consumed.
-            egos: leading axes [style, ego].
-            held_out: leading axes [style, seed].
-
-        Returns:
-            [style, seed, ego].
-        """
-        styles, count = jax.tree.leaves(egos)[0].shape[:2]
-        seeds = jax.tree.leaves(held_out)[0].shape[1]
-        flat_egos = jax.tree.map(
-            lambda leaf: jnp.repeat(leaf[:, None], seeds, axis=1).reshape(-1, *leaf.shape[2:]), egos
-        )
-        flat_partners = jax.tree.map(
-            lambda leaf: jnp.repeat(leaf, count, axis=1).reshape(-1, *leaf.shape[2:]), held_out
-        )
-        flat_styles = partners.repeat_styles(self.env, seeds * count)
-        returns = self.returns(key, flat_egos, flat_partners, flat_styles)
-        return returns.reshape(styles, seeds, count)
-
-
-def policy_vae_gate(run: Run, judge: Judge, key: jax.Array) -> dict[str, Any]:
-    """Whether decoded policies earn what their originals earn, with training partners.
-
-    Returns:
-        Shares of the original's return, decoded / original: the mean and the lowest over the
-        archive, as decoded and with z perturbed by 0.1 of the latents' standard deviation.
-    """
-    population, archive = load_population(run), load_archive(run)
-    vae, params, posterior = load_vae(run)
-    times, env = run.config.partners.train_seeds, run.env
-    play_key, noise_key = jax.random.split(key)
-    originals = partners.flatten(archive.egos.actor)
-    perturbed = policy_vae.perturb(noise_key, posterior.mean, GATE_PERTURBATION)
-    versions = {
-        "original": originals,
-        "decoded": policy_vae.decode(vae, params, posterior.mean),
-        "perturbed": policy_vae.decode(vae, params, perturbed),
-    }
-    repeats = max(1, run.config.compression.gate_games // run.config.evaluation.games)
-    everyone = jax.tree.map(
-        lambda leaf: jnp.tile(leaf, (1, repeats) + (1,) * (leaf.ndim - 2)),
-        population.train_partners,
-    )
-    earned = {}
-    for name, policies in versions.items():
-        by_style = partners.unflatten(policies, len(env.style_names))
-        returns = judge.with_held_out(play_key, by_style, everyone)
-        earned[name] = returns.mean(axis=1)
-    shares = {
-        name: earned[name] / np.maximum(earned["original"], 1e-9)
-        for name in ("decoded", "perturbed")
-    }
-    return {
-        "partners": times,
-        "games": repeats * run.config.evaluation.games,
-        "original_returns": earned["original"],
-        **{f"{name}_share": share for name, share in shares.items()},
-    }
 
 
 def evaluate(run: Run, task: StageProgress) -> dict[str, Any]:
@@ -190,10 +110,6 @@ def nearest_is_right(haland: Haland, v_hat: jax.Array) -> np.ndarray:
     return found == np.arange(len(found))[:, None]
 
 
-def _rows(tree: Any, rows: np.ndarray) -> Any:
-    return jax.tree.map(lambda leaf: leaf[rows], tree)
-
-
 def _generate(haland: Haland, key: jax.Array, v_hat: jax.Array, styles: int) -> tuple[Policy, Any]:
     """One policy for each row [style * n, U]: policies [style, n], latents [style, n, D]."""
     policies, latents = haland.generate_from_task_language(
@@ -264,37 +180,3 @@ def time_generation(haland: Haland, sentence: str) -> dict[str, float]:
             taken.append(1000 * (time.perf_counter() - start))
         found[f"{sampler}_milliseconds"] = float(np.median(taken))
     return found
-
-
-def share_of_oracle(returns: np.ndarray, oracle: np.ndarray) -> float:
-    """Mean over styles and held-out seeds of return / Oracle, where the Oracle earns anything."""
-    usable = oracle > 0
-    return float((returns[usable] / oracle[usable]).mean()) if usable.any() else 0.0
-
-
-def gates(results: Mapping[str, np.ndarray], vae: Mapping[str, Any]) -> dict[str, Any]:
-    """The bars that the method sets itself, with what was measured."""
-    oracle = results[ORACLE]
-
-    def at_least(value: float, bar: float) -> dict[str, Any]:
-        return {"value": value, "bar": bar, "met": bool(value >= bar)}
-
-    share = {method: share_of_oracle(values, oracle) for method, values in results.items()}
-    by_style = results[BEST_RESPONSE].mean(axis=1) / np.maximum(oracle.mean(axis=1), 1e-9)
-    wrong = share[WRONG_SENTENCE]
-    return {
-        "Oracle, lowest style's mean return": at_least(float(oracle.mean(axis=1).min()), 130.0),
-        "best responses / Oracle, mean": at_least(share[BEST_RESPONSE], 0.90),
-        "best responses / Oracle, lowest style": at_least(float(by_style.min()), 0.75),
-        "decoded / original policy, lowest": at_least(float(np.min(vae["decoded_share"])), 0.95),
-        "decoded / original policy, z perturbed, lowest": at_least(
-            float(np.min(vae["perturbed_share"])), 0.95
-        ),
-        "Haland from test sentences / Oracle": at_least(share[TEST_SENTENCES], 0.90),
-        "Haland from a wrong sentence / Oracle": {
-            "value": wrong,
-            "bar": 0.6,
-            "at_most": True,
-            "met": bool(wrong <= 0.6),
-        },
-    }

@@ -14,11 +14,12 @@ import numpy as np
 from experiments.errors import UserError
 
 ORACLE = "Oracle"
+BEST_RESPONSE = "Best response"
 HEADLINE = "Haland, test sentences"
 WRONG = "Haland, wrong sentence"
 METHODS = (
     ORACLE,
-    "Best response",
+    BEST_RESPONSE,
     "VAE reconstruction",
     "Diffusion, true task language",
     "Haland, training sentences",
@@ -87,7 +88,13 @@ def ratios(results: Mapping[str, Any], method: str) -> np.ndarray:
             f"results.json: '{method}' has {measured.shape[1]} held-out seeds a style, the Oracle "
             f"{oracle.shape[1]}"
         )
-    return np.divide(measured, oracle, out=np.full_like(oracle, np.nan), where=oracle > 0)
+    return shares(measured, oracle)
+
+
+def shares(returns: np.ndarray, oracle: np.ndarray) -> np.ndarray:
+    """Returns divided by the same partners' Oracle; NaN where that is not positive."""
+    nothing = np.full(np.shape(oracle), np.nan)
+    return np.divide(returns, oracle, out=nothing, where=np.asarray(oracle) > 0)
 
 
 def dead_partners(results: Mapping[str, Any]) -> int:

@@ -1,0 +1,49 @@
+"""The gates against shares worked out by hand."""
+
+import numpy as np
+import pytest
+
+from experiments import gates, summary
+
+VAE = {"decoded_share": np.array([[0.97, 1.01]]), "perturbed_share": np.array([[0.94, 1.0]])}
+
+
+def results(best, haland, wrong, oracle=((100.0, 200.0), (50.0, 0.0))):
+    """Two styles, two held-out seeds; in the second style the last Oracle earns nothing."""
+    return {
+        summary.ORACLE: np.array(oracle),
+        summary.BEST_RESPONSE: np.array(best),
+        summary.HEADLINE: np.array(haland),
+        summary.WRONG: np.array(wrong),
+    }
+
+
+def test_shares_leave_out_partners_whose_oracle_earns_nothing():
+    earned, oracle = np.array([[90.0, 150.0], [50.0, 7.0]]), np.array([[100.0, 200.0], [50.0, 0.0]])
+    found = summary.shares(earned, oracle)
+    np.testing.assert_allclose(found[0], [0.9, 0.75])
+    assert found[1, 0] == 1.0
+    assert np.isnan(found[1, 1])
+
+
+def test_gates_hold_the_mean_share_and_the_lowest_style():
+    best, haland = ((90.0, 150.0), (50.0, 0.0)), ((80.0, 200.0), (50.0, 0.0))
+    found = gates.gates(results(best, haland, ((60.0, 120.0), (30.0, 0.0))), VAE)
+    # (0.9 + 0.75 + 1.0) / 3; the style with the lowest share earns 240 / 300 of its Oracles.
+    assert found["best responses / Oracle, mean"]["value"] == pytest.approx(2.65 / 3)
+    assert not found["best responses / Oracle, mean"]["met"]
+    assert found["best responses / Oracle, lowest style"]["value"] == pytest.approx(0.8)
+    assert found["best responses / Oracle, lowest style"]["met"]
+    assert found["decoded / original policy, lowest"]["met"]
+    assert not found["decoded / original policy, z perturbed, lowest"]["met"]
+    assert found["Haland from test sentences / Oracle"]["value"] == pytest.approx(2.8 / 3)
+    wrong = found["Haland from a wrong sentence / Oracle"]
+    assert wrong["value"] == pytest.approx(0.6)
+    assert wrong["at_most"]
+
+
+def test_without_any_oracle_no_share_is_met_and_all_values_are_finite():
+    nothing = np.zeros((2, 2))
+    found = gates.gates(results(nothing, nothing, nothing, oracle=nothing), VAE)
+    assert found["Haland from test sentences / Oracle"] == {"value": 0.0, "bar": 0.9, "met": False}
+    assert all(np.isfinite(gate["value"]) for gate in found.values())
