@@ -1,5 +1,6 @@
-"""The sentence files: complete for every kitchen, and checked when they are read."""
+"""The sentence files: complete for every environment, and checked when they are read."""
 
+import re
 from pathlib import Path
 
 import pytest
@@ -8,7 +9,7 @@ from envs.instructions import load_instructions, read_instructions
 
 ORDERS = tuple(f"{soup}_{cell}" for soup in ("onion", "tomato") for cell in (1, 2, 3, 4))
 CORNERS = ("upper_left", "upper_right", "lower_left", "lower_right")
-STYLES = {
+KITCHENS = {
     "center_pots": ("left", "right", "upper", "lower", *CORNERS),
     "crossway": (*CORNERS, "upper_no_dish", "lower_no_dish", "deliver_left", "deliver_right"),
     "diverse_coordination": tuple(
@@ -18,6 +19,13 @@ STYLES = {
     ),
     "diverse_orders": ORDERS,
 }
+LEVELS = tuple(f"level_{level}" for level in range(1, 9))
+STYLES = {f"overcooked/{kitchen}": styles for kitchen, styles in KITCHENS.items()}
+STYLES |= {"lbf/spread": LEVELS}
+NUMBERS = ("one", "two", "three", "four", "five", "six", "seven", "eight")
+ORDINALS = ("first", "second", "third", "fourth", "fifth", "sixth", "seventh", "eighth")
+SMALL = ("smallest", "lightest", "lowest")
+LARGE = ("largest", "heaviest", "highest", "biggest", "greatest")
 GOOD = '[left]\ntrain = ["Go left."]\ntest = ["To the left."]\n'
 
 
@@ -28,15 +36,15 @@ def write(folder: Path, text: str) -> Path:
 
 
 @pytest.mark.parametrize("environment", sorted(STYLES))
-def test_every_kitchen_has_ten_training_and_four_test_sentences(environment):
-    instructions = load_instructions(f"overcooked/{environment}", STYLES[environment])
+def test_every_style_has_ten_training_and_four_test_sentences(environment):
+    instructions = load_instructions(environment, STYLES[environment])
     assert tuple(instructions) == STYLES[environment]
     for style, sentences in instructions.items():
         assert len(sentences.train) == 10, style
         assert len(sentences.test) == 4, style
 
 
-@pytest.mark.parametrize("environment", sorted(STYLES))
+@pytest.mark.parametrize("environment", sorted(KITCHENS))
 def test_sentences_name_what_their_style_is_about(environment):
     words = {
         "left": ("left",),
@@ -57,6 +65,46 @@ def test_sentences_name_what_their_style_is_about(environment):
         for part in style.replace("no_", "").split("_"):
             for sentence in (*train, *test):
                 assert any(word in sentence.lower() for word in words[part]), (style, sentence)
+
+
+def level_said(sentence: str) -> tuple[str, int]:
+    """How a sentence says a level, and which: by its size, as a digit or as a word."""
+    # "The one that …" says no number.
+    words = re.findall(r"\w+", sentence.lower().replace("the one", ""))
+    for before, word in zip(["", *words], words, strict=False):
+        rank = ORDINALS.index(before) if before in ORDINALS else 0
+        if word in SMALL:
+            return "size", rank + 1
+        if word in LARGE:
+            return "size", 8 - rank
+    for word in words:
+        if word.isdecimal():
+            return "digit", int(word)
+        if word in NUMBERS:
+            return "word", NUMBERS.index(word) + 1
+    raise AssertionError(f"no level in {sentence!r}")
+
+
+def test_sentences_of_spread_say_their_level_in_several_ways():
+    for style, (train, test) in load_instructions("lbf/spread", LEVELS).items():
+        for sentences in (train, test):
+            said = [level_said(sentence) for sentence in sentences]
+            assert {level for _, level in said} == {int(style[-1])}, style
+            assert {way for way, _ in said} == {"size", "digit", "word"}, style
+
+
+def test_test_sentences_of_spread_copy_no_training_frame():
+    def frame(sentence: str) -> str:
+        kept = [w for w in re.findall(r"\w+", sentence.lower()) if not w.isdecimal()]
+        said = {*NUMBERS, *ORDINALS, *SMALL, *LARGE}
+        return " ".join(word for word in kept if word not in said)
+
+    instructions = load_instructions("lbf/spread", LEVELS).values()
+    seen = {frame(sentence) for style in instructions for sentence in style.train}
+    asked = {frame(sentence) for style in instructions for sentence in style.test}
+    assert len(seen) > 10
+    assert len(asked) == 8
+    assert not seen & asked
 
 
 def test_the_environment_prefix_may_be_left_out():
