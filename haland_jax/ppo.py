@@ -3,9 +3,11 @@
 `train_chunk` advances one pair by some updates, as a pure function of explicit state; callers
 map it over styles and seeds. Both players learn, or the ego alone against frozen partners.
 The style binds the partner; early in training the ego may be held to its role as well, and
-is then released (`confined_until`).
+is then released (`confined_until`). Partners of several styles may share the games of one ego
+(`StylesByGame`).
 """
 
+from collections.abc import Callable
 from functools import partial
 from typing import Any
 
@@ -48,6 +50,18 @@ class TrainState(PyTreeNode):
     observations: Pair
 
 
+class StylesByGame(PyTreeNode):
+    """Styles that share the games of one ego, in equal parts and in this order.
+
+    The frozen partners of such games are in the order of their styles, equally many of each.
+
+    Attributes:
+        styles: leading axis [style].
+    """
+
+    styles: Any
+
+
 def make_networks(env: Environment) -> tuple[Pair, MLPCritic]:
     """Returns the actors of both players and the critic that either uses."""
     return Pair(*(MLPActor(actions) for actions in env.num_actions)), MLPCritic()
@@ -87,9 +101,7 @@ def init_train_state(
     """Starts the games of one pair; `key` is consumed here and by the training."""
     reset_key, train_key = jax.random.split(key)
     keys = jax.random.split(reset_key, config.num_envs)
-    states, timesteps = jax.vmap(env.training_reset, in_axes=(0, None, None))(
-        keys, style, config.random_start
-    )
+    states, timesteps = _over_games(_restart(env, config.random_start), style)(keys)
     return TrainState(
         update=jnp.zeros((), jnp.int32),
         key=train_key,
@@ -110,7 +122,7 @@ def train_chunk(
         config: settings; `config.num_updates` is the length of the schedules.
         num_updates: updates to do.
         state: where training stands.
-        style: the partner's style.
+        style: the partner's style, or `StylesByGame`.
 
     Returns:
         The new state, and metrics of each update, float32 [num_updates]: `reward`, team
@@ -130,7 +142,7 @@ def _update(
     """One rollout and the learning from it."""
     progress = state.update / config.num_updates
     rollout_key = jax.random.fold_in(state.key, state.update)
-    confined = env.confine(style)
+    confined = _confine(env, style)
     bound = progress < config.confined_until
     style_now = jax.tree.map(lambda held, free: jnp.where(bound, held, free), confined, style)
     remaining = (1 - progress) / (1 - config.random_start_until)
@@ -157,7 +169,8 @@ def _update(
         batch = _make_batch(
             config, critic, learner, steps, state.observations[agent], agent, scaled[agent]
         )
-        learner, loss = _learn(config, actor, critic, learner, batch, **rates)
+        strided = isinstance(style, StylesByGame)
+        learner, loss = _learn(config, actor, critic, learner, batch, strided=strided, **rates)
         state = state.replace(**{role: learner})
         losses.append(loss)
     metrics = {
@@ -166,6 +179,33 @@ def _update(
         "loss": jnp.mean(jnp.stack(losses)),
     }
     return state.replace(update=state.update + 1), metrics
+
+
+def _over_games(function: Callable[..., Any], style: Any) -> Callable[..., Any]:
+    """Maps a function of (style, one game's arguments) over all games, leading axis [env]."""
+    if not isinstance(style, StylesByGame):
+        return jax.vmap(partial(function, style))
+    styles = style.styles
+    count = jax.tree.leaves(styles)[0].shape[0]
+
+    def mapped(*games: Any) -> Any:
+        shares = jax.tree.map(lambda leaf: leaf.reshape(count, -1, *leaf.shape[1:]), games)
+        played = jax.vmap(lambda one, share: jax.vmap(partial(function, one))(*share))(
+            styles, shares
+        )
+        return jax.tree.map(lambda leaf: leaf.reshape(-1, *leaf.shape[2:]), played)
+
+    return mapped
+
+
+def _restart(env: Environment, random_share: jax.Array | float) -> Callable[..., Any]:
+    return lambda style, key: env.training_reset(key, style, random_share)
+
+
+def _confine(env: Environment, style: Any) -> Any:
+    if isinstance(style, StylesByGame):
+        return StylesByGame(jax.vmap(env.confine)(style.styles))
+    return env.confine(style)
 
 
 def _falling(start: float, end: float, progress: jax.Array) -> jax.Array:
@@ -187,6 +227,8 @@ def _rollout(
         partner = partial(actors.partner.apply, state.partner.actor)
     else:
         partner = partial(_frozen_partners, actors.partner, config.partner_noise, state.partner)
+    play = _over_games(lambda style, *game: env.step(*game, style), style)
+    restart_all = _over_games(_restart(env, random_share), style)
 
     def one_step(carry, step_key):
         states, observations = carry
@@ -198,13 +240,8 @@ def _rollout(
         )
         log_probs = jax.tree.map(networks.log_prob, distributions, actions)
         keys = jax.random.split(env_key, config.num_envs)
-        following, timesteps = jax.vmap(env.step, in_axes=(0, 0, 0, None))(
-            keys, states, actions, style
-        )
-        keys = jax.random.split(reset_key, config.num_envs)
-        fresh, first = jax.vmap(env.training_reset, in_axes=(0, None, None))(
-            keys, style, random_share
-        )
+        following, timesteps = play(keys, states, actions)
+        fresh, first = restart_all(jax.random.split(reset_key, config.num_envs))
         done = timesteps.done
 
         def restart(new, old):
@@ -273,6 +310,7 @@ def _learn(
     learner: Learner,
     batch: Batch,
     *,
+    strided: bool,
     learning_rate: jax.Array,
     entropy_weight: jax.Array,
 ) -> tuple[Learner, jax.Array]:
@@ -280,11 +318,16 @@ def _learn(
 
     Games are exchangeable, so each minibatch is a fixed share of them: a shuffle that differs
     between the members of a population would cost as much as the learning itself on a CPU.
+    Games of several styles lie in the order of their styles; with `strided` a minibatch takes
+    every n-th game, and so games of all styles.
     """
     optimizer = make_optimizer(config)
 
     def split(leaf: jax.Array) -> jax.Array:
         by_game = jnp.swapaxes(leaf, 0, 1)
+        if strided:
+            dealt = by_game.reshape(-1, config.num_minibatches, *by_game.shape[1:])
+            return jnp.swapaxes(dealt, 0, 1).reshape(config.num_minibatches, -1, *leaf.shape[2:])
         return by_game.reshape(config.num_minibatches, -1, *leaf.shape[2:])
 
     minibatches = jax.tree.map(split, batch)
