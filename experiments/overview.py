@@ -1,0 +1,167 @@
+"""What one run found in one row, so that environments can stand side by side."""
+
+import dataclasses
+from collections.abc import Mapping
+from typing import Any
+
+import numpy as np
+
+from experiments.summary import (
+    BEST_RESPONSE,
+    HEADLINE,
+    ORACLE,
+    WRONG,
+    mean,
+    ratios,
+    returns,
+    summarise,
+)
+
+UNIVERSAL, UNIVERSAL_WITH_LABEL = "Universal ego", "Universal ego with the style's label"
+
+
+@dataclasses.dataclass(frozen=True)
+class Overview:
+    """One run's row; what was not measured is None.
+
+    Attributes:
+        environment: its name.
+        preset: the run's scale.
+        seed: the run's seed.
+        styles: how many styles.
+        held_out_seeds: held-out partners of each style.
+        oracle: mean return, and its standard deviation over held-out seeds.
+        upper_bound: mean over styles of the bound on the return.
+        oracle_of_bound: mean over styles of Oracle / upper bound.
+        lowest_oracle_of_bound: the same in the style where it is lowest.
+        ceiling: best response / Oracle.
+        haland: mean return from test sentences, and its deviation over held-out seeds.
+        share: Haland from test sentences / Oracle.
+        wrong_share: Haland from a wrong sentence / Oracle.
+        accuracy: share of the test sentences that are translated into their own style.
+        universal: return of one ego for all styles, which is told nothing.
+        universal_with_label: return of one ego for all styles, which is told the style.
+        diagonal: return of best responses with partners of their own style.
+        off_diagonal: return of best responses with partners of the other styles.
+        minutes: all stages together.
+        gates_met: how many gates were met.
+        gates: how many there are.
+        machine: processor and number of its cores.
+        date: day of the run, year-month-day.
+    """
+
+    environment: str
+    preset: str
+    seed: int
+    styles: int
+    held_out_seeds: int
+    oracle: tuple[float, float]
+    upper_bound: float | None
+    oracle_of_bound: float | None
+    lowest_oracle_of_bound: float | None
+    ceiling: float | None
+    haland: tuple[float, float] | None
+    share: float | None
+    wrong_share: float | None
+    accuracy: float | None
+    universal: float | None
+    universal_with_label: float | None
+    diagonal: float | None
+    off_diagonal: float | None
+    minutes: float | None
+    gates_met: int
+    gates: int
+    machine: str | None
+    date: str | None
+
+
+def overview(results: Mapping[str, Any]) -> Overview:
+    """The row of a run, from the content of its results.json.
+
+    Raises:
+        UserError: the results contradict themselves.
+    """
+    oracle = returns(results, ORACLE)
+    bounds, of_bound = _upper_bounds(results, oracle)
+    diagonal, off_diagonal = _cross_play(results)
+    machine = results.get("machine", {})
+    rows = {row.method: row for row in summarise(results)}
+    times, gates = results.get("times"), results.get("gates", {})
+    return Overview(
+        environment=results["environment"],
+        preset=results["preset"],
+        seed=results["seed"],
+        styles=len(results["styles"]),
+        held_out_seeds=oracle.shape[1],
+        oracle=(rows[ORACLE].mean, rows[ORACLE].std),
+        upper_bound=None if bounds is None else float(bounds.mean()),
+        oracle_of_bound=None if of_bound is None else float(of_bound.mean()),
+        lowest_oracle_of_bound=None if of_bound is None else float(of_bound.min()),
+        ceiling=_share(results, BEST_RESPONSE),
+        haland=(rows[HEADLINE].mean, rows[HEADLINE].std) if HEADLINE in rows else None,
+        share=_share(results, HEADLINE),
+        wrong_share=_share(results, WRONG),
+        accuracy=results.get("translator", {}).get("accuracy"),
+        universal=rows[UNIVERSAL].mean if UNIVERSAL in rows else None,
+        universal_with_label=(
+            rows[UNIVERSAL_WITH_LABEL].mean if UNIVERSAL_WITH_LABEL in rows else None
+        ),
+        diagonal=diagonal,
+        off_diagonal=off_diagonal,
+        minutes=sum(times.values()) / 60 if times else None,
+        gates_met=sum(bool(gate["met"]) for gate in gates.values()),
+        gates=len(gates),
+        machine=_machine(machine),
+        date=machine.get("date"),
+    )
+
+
+def number(value: float | None, digits: int = 0) -> str:
+    """The number as a reader wants it; a dash for what was not measured."""
+    return "–" if value is None else f"{value:.{digits}f}"
+
+
+def percent(value: float | None) -> str:
+    """The share in per cent; a dash for what was not measured."""
+    return "–" if value is None else f"{value:.0%}"
+
+
+def with_spread(value: tuple[float, float] | None, seeds: int) -> str:
+    """Mean ± deviation over seeds; one seed has no deviation."""
+    if value is None:
+        return "–"
+    return f"{value[0]:.0f} ± {value[1]:.0f}" if seeds > 1 else f"{value[0]:.0f}"
+
+
+def _share(results: Mapping[str, Any], method: str) -> float | None:
+    """Mean of return / Oracle; None where it was not measured or no Oracle earns anything."""
+    if method not in results["methods"]:
+        return None
+    share = mean(ratios(results, method))
+    return None if np.isnan(share) else share
+
+
+def _upper_bounds(
+    results: Mapping[str, Any], oracle: np.ndarray
+) -> tuple[np.ndarray | None, np.ndarray | None]:
+    """The bound of each style, and Oracle / bound of each style where all bounds are positive."""
+    if not (by_style := results.get("upper_bounds")):
+        return None, None
+    bounds = np.asarray([by_style[style] for style in results["styles"]], float)
+    return bounds, oracle.mean(axis=1) / bounds if (bounds > 0).all() else None
+
+
+def _cross_play(results: Mapping[str, Any]) -> tuple[float | None, float | None]:
+    """Mean return on the diagonal and off it."""
+    if "cross_play" not in results:
+        return None, None
+    values = np.asarray(results["cross_play"], float)
+    own = np.eye(len(values), dtype=bool)
+    return float(values[own].mean()), float(values[~own].mean())
+
+
+def _machine(machine: Mapping[str, Any]) -> str | None:
+    if "processor" not in machine:
+        return None
+    cores = f", {machine['cores']} cores" if "cores" in machine else ""
+    return f"{machine['processor']}{cores}"
