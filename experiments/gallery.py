@@ -6,7 +6,6 @@ from typing import Any
 import jax
 import numpy as np
 
-from envs.overcooked import viewer
 from experiments.progress import StageProgress
 from experiments.stages import Run, load_haland, load_population
 from haland_jax import rollout
@@ -15,6 +14,7 @@ from haland_jax.rollout import Recording
 EPISODES = "figures/episodes"
 GIF_STEPS = 200
 GAMES_TO_CHOOSE_FROM = 5
+SECONDS_AT_THE_END = 1.0
 
 
 def record_episodes(run: Run, task: StageProgress) -> None:
@@ -62,7 +62,7 @@ def save_episode(
     *,
     steps: int | None = None,
 ) -> float:
-    """Writes a game as a GIF.
+    """Writes a game as a GIF, up to its end.
 
     Args:
         env: the environment.
@@ -70,33 +70,43 @@ def save_episode(
         game: what `rollout.record` returned, as NumPy arrays.
         style_name: the partner's style.
         caption: shown under the picture, such as the sentence.
-        steps: only the first steps; all by default.
+        steps: only the first steps; the whole game by default.
 
     Returns:
         The whole game's return.
     """
-    shown = slice(0, min(steps or len(game.rewards), len(game.rewards)))
+    moments = _moments(game)
+    shown = slice(0, min(steps or moments, moments))
     scores = np.concatenate([[0.0], np.cumsum(game.rewards)])[:-1]
-    viewer.save_gif(
+    env.viewer.save_gif(
         path,
-        env.layout,
+        env,
         jax.tree.map(lambda leaf: leaf[shown], game.states),
         style=env.style(style_name),
         scores=scores[shown],
         title=style_name.replace("_", " "),
         caption=caption,
         max_steps=env.max_steps,
+        hold=SECONDS_AT_THE_END,
     )
     return float(game.rewards.sum())
+
+
+def _moments(game: Recording) -> int:
+    """How many of a recording's states belong to the game: the end's too, if it came early."""
+    return min(int(game.alive.sum()) + 1, len(game.alive))
 
 
 def save_moment(
     env: Any, path: Path, game: Recording, style_name: str, caption: str, *, step: int
 ) -> None:
-    """Writes one moment of a game as a PNG and an SVG beside it; arguments as `save_episode`."""
-    step = min(step, len(game.rewards) - 1)
-    scene = viewer.draw_state(
-        env.layout,
+    """Writes one moment of a game as a PNG and an SVG beside it; arguments as `save_episode`.
+
+    Of a game that was over before twice as many steps its middle is shown.
+    """
+    step = min(step, _moments(game) // 2)
+    scene = env.viewer.draw_state(
+        env,
         jax.tree.map(lambda leaf: leaf[step], game.states),
         style=env.style(style_name),
         score=float(game.rewards[:step].sum()),
@@ -104,5 +114,5 @@ def save_moment(
         caption=caption,
         max_steps=env.max_steps,
     )
-    viewer.save_png(path, scene)
-    viewer.save_svg(path.with_suffix(".svg"), scene)
+    env.viewer.save_png(path, scene)
+    env.viewer.save_svg(path.with_suffix(".svg"), scene)

@@ -75,7 +75,7 @@ def main() -> None:
     table.add_row("sounds like", sounds_like)
     table.add_row("policy made in", f"{milliseconds:.0f} ms (warm, {arguments.sampler})")
     table.add_row("partner", f"held-out, style {style}")
-    table.add_row("return", f"{game.rewards.sum():.0f} in {run.env.max_steps} steps")
+    table.add_row("return", f"{game.rewards.sum():.0f} in {game.alive.sum()} steps")
     if arguments.gif is not None:
         save_episode(run.env, arguments.gif, game, style, arguments.sentence)
         table.add_row("episode", str(arguments.gif))

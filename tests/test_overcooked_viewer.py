@@ -8,32 +8,37 @@ import numpy as np
 import pytest
 from PIL import Image, ImageColor
 
-from envs import registry
-from envs.overcooked import chefs, drawing, dynamics, scene, sprites, viewer
-from envs.overcooked.layouts import CLASSIC, STYLED, load_layout
+from envs import drawing, registry
+from envs.overcooked import chefs, dynamics, scene, sprites, viewer
+from envs.overcooked.layouts import CLASSIC, STYLED
 
 TILE = int(sprites.TILE)
 NORTH, SOUTH, EAST, WEST = range(4)
 SOUPS = [4 + 4 * o + t for o in range(4) for t in range(4) if 1 <= o + t <= 3]
 
 
+def make(name):
+    return registry.make(f"overcooked/{name}")
+
+
 @pytest.fixture(scope="module")
 def kitchen():
-    return load_layout("center_pots")
+    return make("center_pots")
 
 
 @pytest.fixture(scope="module")
-def state(kitchen):
-    return jax.tree.map(np.asarray, dynamics.start_state(kitchen))
+def layout(kitchen):
+    return kitchen.layout
 
 
-def style_of(layout, name):
-    return registry.make(f"overcooked/{layout.name}").style(name)
+@pytest.fixture(scope="module")
+def state(layout):
+    return jax.tree.map(np.asarray, dynamics.start_state(layout))
 
 
-def tile(layout, picture, x, y):
+def tile(env, picture, x, y):
     """The pixels of one tile, found from the picture's width and its (caption-free) bottom."""
-    top = picture.shape[0] - layout.height * TILE + y * TILE
+    top = picture.shape[0] - env.layout.height * TILE + y * TILE
     return picture[top : top + TILE, x * TILE : (x + 1) * TILE]
 
 
@@ -41,30 +46,31 @@ def share_of(pixels, colour):
     return np.mean((pixels == ImageColor.getrgb(colour)).all(axis=-1))
 
 
-def render(layout, state, **options):
-    return viewer.to_array(viewer.draw_state(layout, state, **options))
+def render(env, state, **options):
+    return viewer.to_array(viewer.draw_state(env, state, **options))
 
 
-def changed_tiles(layout, before, after):
+def changed_tiles(env, before, after):
     return {
         (x, y)
-        for y in range(layout.height)
-        for x in range(layout.width)
-        if (tile(layout, before, x, y) != tile(layout, after, x, y)).any()
+        for y in range(env.layout.height)
+        for x in range(env.layout.width)
+        if (tile(env, before, x, y) != tile(env, after, x, y)).any()
     }
 
 
 @pytest.mark.parametrize("name", STYLED + CLASSIC)
 def test_each_chef_is_seen_on_its_own_tile_only(name):
-    layout = load_layout(name)
-    picture = render(layout, dynamics.start_state(layout))
+    env = make(name)
+    layout = env.layout
+    picture = render(env, dynamics.start_state(layout))
     assert picture.dtype == np.uint8
     assert picture.shape[1:] == (layout.width * TILE, 3)
     positions = [tuple(layout.floor[cell]) for cell in layout.start]
     for y in range(layout.height):
         for x in range(layout.width):
             for agent, colours in enumerate((chefs.EGO, chefs.PARTNER)):
-                share = share_of(tile(layout, picture, x, y), colours.main)
+                share = share_of(tile(env, picture, x, y), colours.main)
                 assert (share > 0.05) == ((x, y) == positions[agent]), (x, y, agent)
 
 
@@ -74,14 +80,14 @@ def test_a_turn_changes_that_chef_only_and_each_direction_looks_different(kitche
         render(kitchen, state.replace(orientation=np.where(np.arange(2) == agent, way, SOUTH)))
         for way in range(4)
     ]
-    place = {tuple(kitchen.floor[kitchen.start[agent]])}
+    place = {tuple(kitchen.layout.floor[kitchen.layout.start[agent]])}
     for i in range(4):
         for j in range(i):
             assert changed_tiles(kitchen, pictures[i], pictures[j]) == place
 
 
 def test_a_held_item_is_on_the_side_that_the_chef_faces(kitchen, state):
-    x, y = kitchen.floor[kitchen.start[0]]
+    x, y = kitchen.layout.floor[kitchen.layout.start[0]]
     centres = {}
     for way in range(4):
         turned = state.replace(orientation=np.array([way, SOUTH]))
@@ -101,18 +107,19 @@ def test_a_held_item_is_on_the_side_that_the_chef_faces(kitchen, state):
 
 def test_every_item_looks_different_in_hand_and_on_a_counter(kitchen, state):
     seen_on_counter, seen_in_hand = set(), set()
+    chef = kitchen.layout.floor[kitchen.layout.start[0]]
     for code in [0, 1, 2, 3, *SOUPS]:
-        counters = np.zeros(kitchen.num_counters, int)
+        counters = np.zeros(kitchen.layout.num_counters, int)
         counters[0] = code
         picture = render(kitchen, state.replace(counters=counters))
-        seen_on_counter.add(tile(kitchen, picture, *kitchen.stations[0]).tobytes())
+        seen_on_counter.add(tile(kitchen, picture, *kitchen.layout.stations[0]).tobytes())
         picture = render(kitchen, state.replace(held=np.array([code, 0])))
-        seen_in_hand.add(tile(kitchen, picture, *kitchen.floor[kitchen.start[0]]).tobytes())
+        seen_in_hand.add(tile(kitchen, picture, *chef).tobytes())
     assert len(seen_on_counter) == len(seen_in_hand) == 4 + len(SOUPS)
 
 
 def test_a_pot_shows_its_content_the_remaining_steps_and_when_it_is_ready(kitchen, state):
-    pot = kitchen.stations[kitchen.num_counters]
+    pot = kitchen.layout.stations[kitchen.layout.num_counters]
 
     def pot_tile(content, timer):
         contents, timers = np.array([content, 0]), np.array([timer, -1])
@@ -136,25 +143,25 @@ def test_a_pot_shows_its_content_the_remaining_steps_and_when_it_is_ready(kitche
     [("center_pots", "upper_left"), ("crossway", "deliver_left"), ("crossway", "upper_no_dish")],
 )
 def test_exactly_what_a_style_forbids_is_marked(kitchen_name, style_name):
-    layout = load_layout(kitchen_name)
-    style = style_of(layout, style_name)
+    env = make(kitchen_name)
+    layout, style = env.layout, env.style(style_name)
     state = dynamics.start_state(layout, style.start)
-    marked = changed_tiles(layout, render(layout, state), render(layout, state, style=style))
+    marked = changed_tiles(env, render(env, state), render(env, state, style=style))
     floor = layout.floor[~np.asarray(style.cells[1])]
     stations = layout.stations[~np.asarray(style.targets[1])]
     assert len(floor)
     assert marked == {tuple(place) for place in (*floor, *stations)}
-    picture = render(layout, state, style=style)
+    picture = render(env, state, style=style)
     for place in marked:
-        share = share_of(tile(layout, picture, *place), sprites.FORBIDDEN)
+        share = share_of(tile(env, picture, *place), sprites.FORBIDDEN)
         assert (share > 0.01) == (place in {tuple(s) for s in stations})
 
 
 def test_a_room_closed_to_the_partner_by_its_walls_has_no_marks():
-    layout = load_layout("diverse_coordination")
-    style = style_of(layout, "left_no_onion")
-    state = dynamics.start_state(layout, style.start)
-    marked = changed_tiles(layout, render(layout, state), render(layout, state, style=style))
+    env = make("diverse_coordination")
+    style = env.style("left_no_onion")
+    state = dynamics.start_state(env.layout, style.start)
+    marked = changed_tiles(env, render(env, state), render(env, state, style=style))
     assert {(5, 3), (6, 3), (7, 3)} < marked  # the partner's room, right half
     assert (1, 4) in marked  # its onions
     assert not any(y < 2 for _, y in marked)
@@ -186,7 +193,7 @@ def test_captions_wrap_to_the_width_and_lose_no_word():
 
 
 def test_svg_holds_the_same_shapes_as_the_image(kitchen, state):
-    picture = viewer.draw_state(kitchen, state, style=style_of(kitchen, "left"), caption="Hello")
+    picture = viewer.draw_state(kitchen, state, style=kitchen.style("left"), caption="Hello")
     root = ElementTree.fromstring(viewer.to_svg(picture))
     name = "{http://www.w3.org/2000/svg}"
     panels = root.findall(f"{name}svg")
@@ -220,8 +227,9 @@ def test_png_and_svg_files_hold_the_picture(tmp_path, kitchen, state):
 
 @pytest.fixture(scope="module")
 def episode():
-    """Forty random steps in the two rooms: states [T], scores [T]."""
-    layout = load_layout("diverse_coordination")
+    """Forty random steps in the two rooms: environment, states [T]."""
+    env = make("diverse_coordination")
+    layout = env.layout
     actions = jax.random.randint(jax.random.key(0), (40, 2), 0, 6)
 
     def play(state, pair):
@@ -235,15 +243,15 @@ def episode():
         return transition.after, transition.after
 
     start = dynamics.start_state(layout)
-    return layout, jax.jit(lambda: jax.lax.scan(play, start, actions))()[1]
+    return env, jax.jit(lambda: jax.lax.scan(play, start, actions))()[1]
 
 
 @pytest.mark.parametrize("fps", [8.0, 10.0])
 def test_gif_has_every_frame_the_right_duration_and_the_right_colours(tmp_path, episode, fps):
-    layout, states = episode
+    env, states = episode
     scores = np.arange(40.0)
     path = tmp_path / "episode.gif"
-    viewer.save_gif(path, layout, states, scores=scores, caption="Hello", fps=fps, scale=0.5)
+    viewer.save_gif(path, env, states, scores=scores, caption="Hello", fps=fps, scale=0.5)
     gif = Image.open(path)
     assert gif.n_frames == 40
     assert gif.info["loop"] == 0
@@ -253,7 +261,7 @@ def test_gif_has_every_frame_the_right_duration_and_the_right_colours(tmp_path, 
         duration += gif.info["duration"]
         if t in (0, 17, 39):
             moment = jax.tree.map(lambda leaf, t=t: leaf[t], states)
-            picture = viewer.draw_state(layout, moment, score=scores[t], caption="Hello")
+            picture = viewer.draw_state(env, moment, score=scores[t], caption="Hello")
             wanted = viewer.to_array(picture, 0.5).astype(int)
             shown = np.asarray(gif.convert("RGB")).astype(int)
             assert np.abs(shown - wanted).mean() < 2.0
@@ -261,20 +269,38 @@ def test_gif_has_every_frame_the_right_duration_and_the_right_colours(tmp_path, 
     assert duration == pytest.approx(1000 * 40 / fps, abs=10)
 
 
+def test_a_held_gif_shows_its_last_moment_longer(tmp_path, episode):
+    env, states = episode
+    few = jax.tree.map(lambda leaf: leaf[:4], states)
+    viewer.save_gif(tmp_path / "a.gif", env, few, hold=1.0, scale=0.5)
+    gif = Image.open(tmp_path / "a.gif")
+    shown = []
+    for t in range(gif.n_frames):
+        gif.seek(t)
+        shown.append(gif.info["duration"])
+    assert len(shown) == 4
+    assert shown[:3] == pytest.approx([1000 / viewer.FPS] * 3, abs=10)
+    assert shown[3] == pytest.approx(1000 + 1000 / viewer.FPS, abs=10)
+
+
+def test_the_viewer_comes_with_the_environment(kitchen):
+    assert kitchen.viewer is viewer
+
+
 def test_gif_from_a_list_equals_gif_from_a_stacked_state(tmp_path, episode):
-    layout, states = episode
+    env, states = episode
     few = jax.tree.map(lambda leaf: leaf[:5], states)
     listed = [jax.tree.map(lambda leaf, t=t: leaf[t], states) for t in range(5)]
-    viewer.save_gif(tmp_path / "a.gif", layout, few, scale=0.5)
-    viewer.save_gif(tmp_path / "b.gif", layout, listed, scale=0.5)
+    viewer.save_gif(tmp_path / "a.gif", env, few, scale=0.5)
+    viewer.save_gif(tmp_path / "b.gif", env, listed, scale=0.5)
     assert (tmp_path / "a.gif").read_bytes() == (tmp_path / "b.gif").read_bytes()
 
 
 def test_a_long_gif_is_small(tmp_path, episode):
-    layout, states = episode
+    env, states = episode
     ten_times = jax.tree.map(lambda leaf: np.concatenate([leaf] * 10), states)
     ten_times = ten_times.replace(time=np.arange(1, 401))
-    viewer.save_gif(tmp_path / "a.gif", layout, ten_times, title="left", caption="Hello")
+    viewer.save_gif(tmp_path / "a.gif", env, ten_times, title="left", caption="Hello")
     assert Image.open(tmp_path / "a.gif").n_frames == 400
     assert (tmp_path / "a.gif").stat().st_size < 1.5e6
 
@@ -301,14 +327,15 @@ def test_impossible_states_are_refused(kitchen, state, change, message):
 
 
 def test_wrong_arguments_are_refused(tmp_path, kitchen, state):
-    crossway = load_layout("crossway")
     with pytest.raises(ValueError, match=r"style\.cells must have shape"):
-        viewer.draw_state(kitchen, state, style=style_of(crossway, "upper_left"))
+        viewer.draw_state(kitchen, state, style=make("crossway").style("upper_left"))
     path = tmp_path / "a.gif"
     with pytest.raises(ValueError, match="2 scores for 1 states"):
         viewer.save_gif(path, kitchen, [state], scores=[0, 1])
     with pytest.raises(ValueError, match="fps must be in"):
         viewer.save_gif(path, kitchen, [state], fps=0)
+    with pytest.raises(ValueError, match="hold must be"):
+        viewer.save_gif(path, kitchen, [state], hold=-1)
     with pytest.raises(ValueError, match="at least one state"):
         viewer.save_gif(path, kitchen, [])
     with pytest.raises(ValueError, match="one leading axis"):

@@ -14,8 +14,6 @@ import numpy as np
 from pettingzoo import ParallelEnv
 
 from envs.base import AGENTS, Environment, Pair, TimeStep
-from envs.overcooked import viewer
-from envs.overcooked.env import Overcooked
 
 FrameFn = Callable[[Any, Any], np.ndarray]
 
@@ -32,8 +30,8 @@ class PettingZooEnvironment(ParallelEnv[str, np.ndarray, int]):
         environment: an environment with discrete actions, such as `registry.make` returns.
         style_names: styles to draw from; all of the environment's by default.
         render_mode: None or "rgb_array".
-        frame_fn: draws (state, style) as uint8 [height, width, 3]; needed to render anything but
-            Overcooked.
+        frame_fn: draws (state, style) as uint8 [height, width, 3]; by default the environment's
+            `viewer` does.
 
     Raises:
         ValueError: no style, an unknown style, an unknown render mode, or no `frame_fn` for it.
@@ -56,8 +54,8 @@ class PettingZooEnvironment(ParallelEnv[str, np.ndarray, int]):
             )
         if render_mode not in (None, "rgb_array"):
             raise ValueError(f"render_mode is {render_mode!r}; expected None or 'rgb_array'")
-        if frame_fn is None and isinstance(environment, Overcooked):
-            frame_fn = _overcooked_frame_fn(environment)
+        if frame_fn is None and hasattr(environment, "viewer"):
+            frame_fn = _viewers_frame_fn(environment)
         if render_mode is not None and frame_fn is None:
             raise ValueError(f"{environment.name} needs a frame_fn to be rendered")
         self.environment = environment
@@ -187,11 +185,9 @@ class PettingZooEnvironment(ParallelEnv[str, np.ndarray, int]):
         return infos
 
 
-def _overcooked_frame_fn(environment: Overcooked) -> FrameFn:
+def _viewers_frame_fn(environment: Any) -> FrameFn:
     def draw(state: Any, style: Any) -> np.ndarray:
-        scene = viewer.draw_state(
-            environment.layout, state, style=style, max_steps=environment.max_steps
-        )
-        return viewer.to_array(scene)
+        viewer = environment.viewer
+        return viewer.to_array(viewer.draw_state(environment, state, style=style))
 
     return draw

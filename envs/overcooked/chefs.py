@@ -7,27 +7,13 @@ partner green and a flat beret, so that they differ in outline as well as in col
 from __future__ import annotations
 
 import functools
-from dataclasses import dataclass
 
-from envs.overcooked.drawing import Ellipse, Line, Polygon, Rect, Shape, circle, place
-from envs.overcooked.sprites import INK, item_shapes
+from envs.drawing import Ellipse, Line, Polygon, Rect, Shape, circle, place
+from envs.framing import EGO, INK, PARTNER, PlayerColours
+from envs.overcooked.sprites import item_shapes
 
 NORTH, SOUTH, EAST, WEST = range(4)
 
-
-@dataclass(frozen=True)
-class ChefColours:
-    """A chef's jacket and hat, their darker trim, the lighter apron, and the hair."""
-
-    main: str
-    dark: str
-    light: str
-    hair: str
-
-
-# The two main colours differ in lightness too, for readers who can not tell blue from green.
-EGO = ChefColours(main="#2a62c8", dark="#173f8a", light="#c9dcfb", hair="#4a2f1d")
-PARTNER = ChefColours(main="#35b57c", dark="#147a4d", light="#d5f5e4", hair="#1f1b1a")
 _SKIN, _SKIN_EDGE, _CHEEK = "#f7d3ae", "#c98f5f", "#f0a58a"
 _HEAD_X, _HEAD_Y = 32.0, 29.0
 _ITEM_PLACE = {NORTH: (32, 12.5), SOUTH: (32, 50), EAST: (52, 47), WEST: (12, 47)}
@@ -61,7 +47,7 @@ def chef_shapes(agent: int, orientation: int, held: int) -> tuple[Shape, ...]:
     return (shadow, *torso, *head, *arms, *item, *hands)
 
 
-def _torso(colours: ChefColours, orientation: int) -> tuple[Shape, ...]:
+def _torso(colours: PlayerColours, orientation: int) -> tuple[Shape, ...]:
     feet = (Ellipse(25.5, 57.5, 5, 3.2, INK), Ellipse(38.5, 57.5, 5, 3.2, INK))
     jacket = Rect(19, 37, 26, 20, colours.main, 9, colours.dark, 1.8)
     if orientation == NORTH:
@@ -76,7 +62,7 @@ def _torso(colours: ChefColours, orientation: int) -> tuple[Shape, ...]:
     return (*feet, jacket, apron)
 
 
-def _head(colours: ChefColours, orientation: int) -> tuple[Shape, ...]:
+def _head(colours: PlayerColours, orientation: int) -> tuple[Shape, ...]:
     x, y = _HEAD_X, _HEAD_Y
     if orientation == NORTH:
         ears = (circle(x - 12.5, y + 1, 3, _SKIN), circle(x + 12.5, y + 1, 3, _SKIN))
@@ -109,7 +95,7 @@ def _head(colours: ChefColours, orientation: int) -> tuple[Shape, ...]:
     )
 
 
-def _hat(agent: int, colours: ChefColours) -> tuple[Shape, ...]:
+def _hat(agent: int, colours: PlayerColours) -> tuple[Shape, ...]:
     x, y = _HEAD_X, _HEAD_Y
     if agent == 0:
         puff = tuple(
@@ -126,7 +112,7 @@ def _hat(agent: int, colours: ChefColours) -> tuple[Shape, ...]:
 
 
 def _arms(
-    colours: ChefColours, orientation: int, holding: bool
+    colours: PlayerColours, orientation: int, holding: bool
 ) -> tuple[tuple[Shape, ...], tuple[Shape, ...]]:
     if orientation == NORTH and not holding:
         ends = (((20, 42), (15.5, 36.5)), ((44, 42), (48.5, 36.5)))

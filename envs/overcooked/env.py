@@ -2,6 +2,7 @@
 
 import dataclasses
 import functools
+from types import ModuleType
 from typing import ClassVar, Literal
 
 import jax
@@ -104,6 +105,13 @@ class Overcooked:
         """Length of each player's feature vector; the partner's ends with its task."""
         size = observation.num_features(self.layout)
         return Pair(size, size + self.styles.task.shape[-1])
+
+    @property
+    def viewer(self) -> ModuleType:
+        """The module that draws the kitchen; imported on first use, since play never needs it."""
+        from envs.overcooked import viewer
+
+        return viewer
 
     def reset(self, key: jax.Array, style: Style) -> tuple[State, TimeStep]:
         """Starts a game in the empty kitchen.

@@ -3,30 +3,22 @@
 from __future__ import annotations
 
 import functools
-from typing import NamedTuple
+from typing import TYPE_CHECKING, NamedTuple
 
 import numpy as np
 
+from envs.drawing import Panel, Scene, Shape, place
+from envs.framing import Legend, frame
 from envs.overcooked import chefs, sprites
-from envs.overcooked.drawing import (
-    Panel,
-    Rect,
-    Scene,
-    Shape,
-    Text,
-    circle,
-    place,
-    text_width,
-    wrap_text,
-)
 from envs.overcooked.dynamics import State
 from envs.overcooked.layouts import Layout
-from envs.overcooked.sprites import INK, TILE
+from envs.overcooked.sprites import TILE
 from envs.overcooked.styles import Style
 
-_PAGE, _MUTED, _TRACK = "#fffdf8", "#6b7280", "#e6e0d4"
-_MARGIN, _HEADER_HEIGHT = 10.0, 52.0
-_CAPTION_SIZE, _CAPTION_LEADING = 13.0, 18.0
+if TYPE_CHECKING:
+    from envs.overcooked.env import Overcooked
+
+_CLOSED: Legend = ("closed to partner", sprites.FORBIDDEN_SYMBOL)
 
 
 class _View(NamedTuple):
@@ -41,52 +33,52 @@ class _View(NamedTuple):
 
 
 def draw_state(
-    layout: Layout,
+    env: Overcooked,
     state: State,
     *,
     style: Style | None = None,
     score: float | None = None,
     title: str | None = None,
     caption: str | None = None,
-    max_steps: int = 400,
+    max_steps: int | None = None,
 ) -> Scene:
     """Draw one moment of a game.
 
     Args:
-        layout: the kitchen.
+        env: the environment.
         state: the moment, unbatched.
         style: the partner's style; in the partner's room, the cells forbidden to it are hatched,
             and the stations forbidden to it are paler and have a "no" mark.
         score: sum of rewards so far, for the header.
         title: the style's name, or any short title; the kitchen's name by default.
         caption: a sentence to print below the kitchen, wrapped to its width.
-        max_steps: length of a game in steps, for the header.
+        max_steps: length of a game in steps, for the header; the environment's by default.
 
     Raises:
         ValueError: the state or the style does not belong to the layout, or has impossible values.
     """
+    layout = env.layout
     view = _read_state(layout, state)
     forbidden_cells, forbidden_stations = _forbidden(layout, style, state)
-    width = layout.width * TILE
-    top = _HEADER_HEIGHT
-    name = (layout.name if title is None else title).replace("_", " ")
-    marked = bool(forbidden_cells or forbidden_stations)
-    header = _header(width, name, score, f"step {view.time}/{max_steps}", marked)
-    progress = _progress_bar(width, view.time / max_steps)
+    closed = forbidden_cells | forbidden_stations
     contents = _contents(layout, view, forbidden_stations)
-    panels = [Panel(0, 0, width, top, header + progress)]
+    panels = []
     for y, row in enumerate(layout.terrain):
         for x, kind in enumerate(row):
-            fixed = _fixed_tile(layout, x, y, kind, (x, y) in forbidden_cells | forbidden_stations)
+            fixed = _fixed_tile(layout, x, y, kind, (x, y) in closed)
             shapes = fixed + contents.get((x, y), ())
-            panels.append(Panel(x * TILE, top + y * TILE, TILE, TILE, shapes))
-    height = top + layout.height * TILE
-    if caption:
-        footer = _caption(caption, width)
-        footer_height = _MARGIN * 2 + _CAPTION_LEADING * (len(footer) - 1)
-        panels.append(Panel(0, height, width, footer_height, footer))
-        height += footer_height
-    return Scene(width, height, _PAGE, tuple(panels))
+            panels.append(Panel(x * TILE, y * TILE, TILE, TILE, shapes))
+    return frame(
+        panels,
+        layout.width * TILE,
+        layout.height * TILE,
+        title=layout.name if title is None else title,
+        score=score,
+        time=view.time,
+        max_steps=max_steps or env.max_steps,
+        caption=caption,
+        legend=(_CLOSED,) if closed else (),
+    )
 
 
 # --- Reading states ------------------------------------------------------------------------------
@@ -209,46 +201,3 @@ def _contents(
     for agent, position in enumerate(view.positions):
         contents[position] = chefs.chef_shapes(agent, view.orientations[agent], view.held[agent])
     return contents
-
-
-def _header(
-    width: float, name: str, score: float | None, step: str, marked: bool
-) -> tuple[Shape, ...]:
-    points = "" if score is None else f"{score:g}"
-    points_width = text_width(points, 17, bold=True)
-    label_width = text_width("score", 11) + 5 if points else 0.0
-    room = width - 3 * _MARGIN - points_width - label_width
-    size = min(15.0, 15.0 * room / max(text_width(name, 15, bold=True), 1.0))
-    right = width - _MARGIN
-    shapes: list[Shape] = [Text(_MARGIN, 21, name, size, INK, bold=True)]
-    if points:
-        shapes.append(Text(right, 21.5, points, 17, INK, "end", bold=True))
-        shapes.append(Text(right - points_width - 5, 21, "score", 11, _MUTED, "end"))
-    x = _MARGIN
-    for label, symbol in (
-        ("ego", (circle(0, 0, 4.5, chefs.EGO.main, chefs.EGO.dark, 1.2),)),
-        ("partner", (circle(0, 0, 4.5, chefs.PARTNER.main, chefs.PARTNER.dark, 1.2),)),
-        *((("closed to partner", sprites.FORBIDDEN_SYMBOL),) if marked else ()),
-    ):
-        shapes.extend(place(symbol, x + 4.5, 36.5))
-        shapes.append(Text(x + 13, 40.5, label, 11, _MUTED))
-        x += 13 + text_width(label, 11) + 12
-    return (*shapes, Text(right, 40.5, step, 11, _MUTED, "end"))
-
-
-def _progress_bar(width: float, share: float) -> tuple[Shape, ...]:
-    done = width * min(max(share, 0.0), 1.0)
-    return (
-        Rect(0, _HEADER_HEIGHT - 3, width, 3, _TRACK),
-        Rect(0, _HEADER_HEIGHT - 3, done, 3, sprites.PROGRESS),
-    )
-
-
-def _caption(caption: str, width: float) -> tuple[Shape, ...]:
-    lines = wrap_text(caption, _CAPTION_SIZE, width - 2 * _MARGIN - 8)
-    bar = Rect(_MARGIN, 10, 3, _CAPTION_LEADING * len(lines), chefs.PARTNER.main, 1.5)
-    rows = (
-        Text(_MARGIN + 11, 23.5 + _CAPTION_LEADING * k, line, _CAPTION_SIZE, INK)
-        for k, line in enumerate(lines)
-    )
-    return (bar, *rows)

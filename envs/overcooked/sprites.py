@@ -9,15 +9,15 @@ from __future__ import annotations
 
 import functools
 
-from envs.overcooked.drawing import Arc, Ellipse, Line, Polygon, Rect, Shape, Text, circle, place
+from envs.drawing import Arc, Ellipse, Line, Polygon, Rect, Shape, Text, circle, place
+from envs.framing import INK, PROGRESS
 
 TILE = 64.0
 
-INK = "#2b2f38"
 FLOOR = ("#f3ecdf", "#ece3d2")
 COUNTER_TOP, COUNTER_EDGE, COUNTER_FRONT = "#dcb98d", "#c99f6e", "#a97d4e"
 STEEL, STEEL_EDGE = "#aeb7c2", "#7d8896"
-PROGRESS, READY = "#f28c28", "#2f9e57"
+READY = "#2f9e57"
 FORBIDDEN = "#c8364a"
 
 

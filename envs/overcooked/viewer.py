@@ -1,163 +1,24 @@
 """Pictures of an Overcooked game: one state as SVG, PNG or array, an episode as GIF.
 
-scene = draw_state(layout, state, style=style, score=40, title="left", caption="I stay left.")
+scene = draw_state(env, state, style=style, score=40, title="left", caption="I stay left.")
 save_png("kitchen.png", scene, scale=2)
-save_gif("episode.gif", layout, states, style=style, scores=scores, title="left")
+save_gif("episode.gif", env, states, style=style, scores=scores, title="left")
 """
 
-from __future__ import annotations
-
-import itertools
-from collections.abc import Sequence
-from pathlib import Path
-
-import jax
-import numpy as np
-from PIL import Image
-
-from envs.overcooked.drawing import (
-    Scene,
-    Shape,
-    panel_box,
-    panel_image,
-    to_array,
-    to_image,
-    to_svg,
-)
-from envs.overcooked.dynamics import State
-from envs.overcooked.layouts import Layout
+from envs.drawing import to_array, to_image, to_svg
 from envs.overcooked.scene import draw_state
-from envs.overcooked.styles import Style
+from envs.pictures import save_gif, save_png, save_svg
 
-__all__ = ["draw_state", "save_gif", "save_png", "save_svg", "to_array", "to_image", "to_svg"]
+__all__ = [
+    "FPS",
+    "draw_state",
+    "save_gif",
+    "save_png",
+    "save_svg",
+    "to_array",
+    "to_image",
+    "to_svg",
+]
 
-_GIF_COLOURS = 255
-# The palette's last entry is transparent: "as in the frame before", which compresses to nothing.
-_UNCHANGED = 255
-_PALETTE_SCENES = 24
-
-
-def save_svg(path: str | Path, scene: Scene) -> None:
-    """Write the scene as an SVG file."""
-    Path(path).write_text(to_svg(scene), encoding="utf-8")
-
-
-def save_png(path: str | Path, scene: Scene, scale: float = 1.0) -> None:
-    """Write the scene as a PNG file, `scale` pixels a unit (a tile is 64 units)."""
-    to_image(scene, scale).save(path, format="PNG", optimize=True)
-
-
-def save_gif(
-    path: str | Path,
-    layout: Layout,
-    states: State | Sequence[State],
-    *,
-    style: Style | None = None,
-    scores: Sequence[float] | np.ndarray | None = None,
-    title: str | None = None,
-    caption: str | None = None,
-    max_steps: int = 400,
-    fps: float = 8.0,
-    scale: float = 0.75,
-) -> None:
-    """Write an episode as an endlessly repeating GIF file.
-
-    Args:
-        path: the file.
-        layout: the kitchen.
-        states: the moments, as one `State` with a leading axis [T] or as a sequence of T states.
-        style, title, caption, max_steps: as in `draw_state`.
-        scores: sum of rewards so far at each moment, [T].
-        fps: moments a second, at most 50 (viewers slow down faster files).
-        scale: pixels a unit (a tile is 64 units).
-
-    Raises:
-        ValueError: no states, not as many scores as states, `fps` out of range, or what
-            `draw_state` raises.
-    """
-    if not 0 < fps <= 50:
-        raise ValueError(f"fps must be in (0, 50], got {fps}")
-    moments = _split_time(states)
-    if scores is not None and len(scores) != len(moments):
-        raise ValueError(f"got {len(scores)} scores for {len(moments)} states")
-    scenes = [
-        draw_state(
-            layout,
-            moment,
-            style=style,
-            score=None if scores is None else float(scores[t]),
-            title=title,
-            caption=caption,
-            max_steps=max_steps,
-        )
-        for t, moment in enumerate(moments)
-    ]
-    frames = _shared_palette_frames(scenes, scale)
-    # GIF counts in hundredths of a second: rounding the moments, not the steps, keeps the tempo.
-    ticks = [round(100 * t / fps) for t in range(len(scenes) + 1)]
-    durations = [10 * (after - before) for before, after in itertools.pairwise(ticks)]
-    frames[0].save(
-        path,
-        format="GIF",
-        save_all=True,
-        append_images=frames[1:],
-        duration=durations,
-        loop=0,
-        transparency=_UNCHANGED,
-        disposal=1,  # each frame stays under the next
-        optimize=False,
-    )
-
-
-def _split_time(states: State | Sequence[State]) -> list[State]:
-    if not isinstance(states, State):
-        moments = [jax.tree.map(np.asarray, state) for state in states]
-    else:
-        arrays = jax.tree.map(np.asarray, states)
-        if arrays.time.ndim != 1:
-            raise ValueError(
-                f"states need one leading axis [T], got time of shape {arrays.time.shape}; "
-                "for a single state, use draw_state"
-            )
-        moments = [jax.tree.map(lambda leaf, t=t: leaf[t], arrays) for t in range(len(arrays.time))]
-    if not moments:
-        raise ValueError("an episode needs at least one state, got none")
-    return moments
-
-
-def _shared_palette_frames(scenes: list[Scene], scale: float) -> list[Image.Image]:
-    """Render scenes of one size and arrangement; from the second on, only what has changed."""
-    palette = _palette(scenes, scale)
-    colours = palette.getpalette() or []
-    width, height = to_image(scenes[0], scale).size
-    current = np.zeros((height, width), np.uint8)
-    quantized: dict[tuple, np.ndarray] = {}
-    drawn: list[tuple[Shape, ...] | None] = [None] * len(scenes[0].panels)
-    frames = []
-    for t, scene in enumerate(scenes):
-        before = current.copy()
-        for k, panel in enumerate(scene.panels):
-            if panel.shapes == drawn[k]:
-                continue
-            image = panel_image(panel, scale, scene.background)
-            key = (panel.shapes, image.size)
-            if key not in quantized:
-                plain = image.quantize(palette=palette, dither=Image.Dither.NONE)
-                quantized[key] = np.asarray(plain)
-            left, top, right, bottom = panel_box(panel, scale)
-            current[top:bottom, left:right] = quantized[key]
-            drawn[k] = panel.shapes
-        indices = current.copy() if t == 0 else np.where(current == before, _UNCHANGED, current)
-        frame = Image.fromarray(indices.astype(np.uint8), "P")
-        frame.putpalette([*colours, *(0,) * (3 * (_UNCHANGED + 1) - len(colours))])
-        frames.append(frame)
-    return frames
-
-
-def _palette(scenes: list[Scene], scale: float) -> Image.Image:
-    """A palette for the colours of a sample of the scenes."""
-    sample = scenes[:: max(1, len(scenes) // _PALETTE_SCENES)]
-    panels = {panel.shapes: panel for scene in sample for panel in scene.panels}
-    images = [panel_image(panel, scale, sample[0].background) for panel in panels.values()]
-    pixels = np.concatenate([np.asarray(image).reshape(-1, 3) for image in images])
-    return Image.fromarray(pixels[None]).quantize(_GIF_COLOURS, Image.Quantize.MEDIANCUT, kmeans=1)
+FPS = 8.0
+"""Steps of a game that an episode's picture shows in a second."""
