@@ -4,11 +4,13 @@ from collections.abc import Callable
 from typing import Any
 
 from envs.base import Environment
+from envs.lbf.env import make_lbf
 from envs.overcooked.env import make_overcooked
 from envs.overcooked.layouts import CLASSIC, STYLED
 
 _FAMILIES: dict[str, tuple[tuple[str, ...], Callable[..., Any]]] = {
     "overcooked": (STYLED + CLASSIC, make_overcooked),
+    "lbf": (("spread",), make_lbf),
 }
 
 

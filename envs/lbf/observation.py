@@ -1,0 +1,126 @@
+"""What a player sees in lbforaging 2.0.0's terms: its flat vector and its grid.
+
+Reference: `ForagingEnv._make_gym_obs` of lbforaging 2.0.0, with its agents' levels observed.
+"""
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+
+from envs.lbf.dynamics import Rules, State
+
+GRID_LAYERS = ("players", "foods", "free")
+_BITS = 10
+"""Bits of a row, a column and a level while they travel in one integer."""
+
+
+def flat_size(num_players: int, num_foods: int) -> int:
+    """Returns the length of the flat observation."""
+    return 3 * (num_foods + num_players)
+
+
+def foods_in_sight(rules: Rules, state: State) -> jax.Array:
+    """Returns which foods that are still there each player sees, bool [player, food]."""
+    there = jnp.broadcast_to(state.food_level > 0, (len(state.place), len(state.food_level)))
+    if rules.sight is None:
+        return there
+    away = jnp.abs(state.food_place[None] - state.place[:, None])
+    return there & jnp.all(away <= rules.sight, axis=-1)
+
+
+def _packed(place: jax.Array, level: jax.Array) -> jax.Array:
+    """Row, column (each plus one, so that nothing is (-1, -1)) and level in one integer."""
+    return ((place[..., 0] + 1) << (2 * _BITS)) | ((place[..., 1] + 1) << _BITS) | level
+
+
+def _unpacked(code: jax.Array) -> jax.Array:
+    """(row, column, level) of packed entries; an empty entry is (-1, -1, 0); int32 [..., 3]."""
+    mask = (1 << _BITS) - 1
+    parts = ((code >> (2 * _BITS)) - 1, ((code >> _BITS) & mask) - 1, code & mask)
+    return jnp.stack(parts, axis=-1)
+
+
+def _in_order(code: jax.Array, rank: jax.Array, chosen: jax.Array) -> jax.Array:
+    """Puts the chosen entries at their ranks and nothing in the places behind; [..., entry]."""
+    slots = np.arange(code.shape[-1])
+    at_slot = chosen[..., None, :] & (rank[..., None, :] == slots[:, None])
+    return jnp.sum(jnp.where(at_slot, code[..., None, :], 0), axis=-1)
+
+
+def _window_start(rules: Rules, state: State) -> jax.Array:
+    """The first row and column that each player sees, int32 [player, 2]."""
+    if rules.sight is None:
+        return jnp.zeros_like(state.place)
+    return jnp.maximum(state.place - rules.sight, 0)
+
+
+def flat(rules: Rules, state: State) -> jax.Array:
+    """Returns each player's flat observation, int32 [player, 3 * (food + player)].
+
+    (row, column, level) of each food in sight, from the top left row by row, then of the player
+    itself, then of the others in sight; places that are left over hold (-1, -1, 0). Rows and
+    columns count from the first that the player sees. As in the reference, a player less than
+    `sight` from the upper or left border sees other players up to 2 * sight from that border.
+    """
+    num_players = len(state.place)
+    start = _window_start(rules, state)
+    key = state.food_place[:, 0] * rules.columns + state.food_place[:, 1]
+    earlier = key[None, :] < key[:, None]
+    seen = foods_in_sight(rules, state)
+    if rules.sight is None:  # all see the same
+        seen, start = seen[:1], start[:1]
+    rank = jnp.sum(seen[:, None, :] & earlier, axis=-1)
+    code = _packed(state.food_place[None] - start[:, None], state.food_level)
+    foods = _in_order(code, rank, seen)
+    foods = jnp.broadcast_to(foods, (num_players, foods.shape[1]))
+
+    # The player itself comes first, the others follow in their own order.
+    order = np.array(
+        [[p, *(q for q in range(num_players) if q != p)] for p in range(num_players)], np.int32
+    )
+    place = jnp.stack([jnp.stack([state.place[q] for q in row]) for row in order])
+    level = jnp.stack([jnp.stack([state.level[q] for q in row]) for row in order])
+    place -= start[:, None]
+    code = _packed(place, level)
+    if rules.sight is not None:
+        visible = jnp.all((place >= 0) & (place <= 2 * rules.sight), axis=-1)
+        rank = jnp.cumsum(visible, axis=1) - visible
+        code = _in_order(code, rank, visible)
+    entries = _unpacked(jnp.concatenate([foods, code], axis=1))
+    return entries.reshape(num_players, -1)
+
+
+def grid(rules: Rules, state: State) -> jax.Array:
+    """Returns each player's grid observation, int8 [player, 3, 2 * reach + 1, 2 * reach + 1].
+
+    Layers are named by `GRID_LAYERS`: levels of players, levels of foods, 1 where a cell can be
+    entered; the player itself is in the centre, and what lies outside the field is 0. Two
+    players on one cell show the level of the later one, as in the reference.
+    """
+    reach = rules.reach
+    side = 2 * reach + 1
+    steps = np.arange(side) - reach
+    across = np.arange(side * side)
+
+    def window_key(place: jax.Array, own: jax.Array) -> jax.Array:
+        """Index of cells in a player's window, -1 outside."""
+        away = place - own
+        inside = jnp.all(jnp.abs(away) <= reach, axis=-1)
+        return jnp.where(inside, (away[..., 0] + reach) * side + away[..., 1] + reach, -1)
+
+    def one(own: jax.Array) -> jax.Array:
+        players, foods = jnp.zeros(side * side, jnp.int32), jnp.zeros(side * side, jnp.int32)
+        player_keys, food_keys = window_key(state.place, own), window_key(state.food_place, own)
+        for index in range(len(state.level)):
+            players = jnp.where(across == player_keys[index], state.level[index], players)
+        for index in range(len(state.food_level)):
+            foods = jnp.where(across == food_keys[index], state.food_level[index], foods)
+        row, column = own[0] + steps, own[1] + steps
+        inside = ((row >= 0) & (row < rules.rows))[:, None] & (
+            (column >= 0) & (column < rules.columns)
+        )
+        free = inside.ravel() & (players == 0) & (foods == 0)
+        layers = jnp.stack([players, foods, free.astype(jnp.int32)]).astype(jnp.int8)
+        return layers.reshape(3, side, side)
+
+    return jax.vmap(one)(state.place)
