@@ -1,6 +1,6 @@
 """The run's report for a reader who was not there, and its summary for the terminal."""
 
-from collections.abc import Iterable, Mapping, Sequence
+from collections.abc import Iterable, Mapping
 from pathlib import Path
 from typing import Any
 
@@ -8,10 +8,14 @@ import numpy as np
 from rich.table import Table
 
 from experiments.figures import draw_figures
+from experiments.markdown import table as _table
 from experiments.summary import (
+    COMPARISONS,
     HEADLINE,
     METHODS,
     ORACLE,
+    UNIVERSAL,
+    UNIVERSAL_WITH_LABEL,
     WRONG,
     MethodSummary,
     dead_partners,
@@ -22,8 +26,10 @@ from experiments.summary import (
     spread,
     summarise,
 )
+from experiments.worth import steps_in_words, worth_of_the_style
 
 _AIM = 0.95
+_WORTH_FIGURE = "cross_play"
 _MEANING = {
     ORACLE: "the best of several egos refitted to that very partner: the upper bound",
     "Best response": "the archived egos of the same style, which never met these partners: the "
@@ -43,8 +49,9 @@ _CAPTIONS = {
     "on its left is that step's cost.",
     "comparisons_by_style": "The same for the baselines and ablations, beside the Oracle and "
     "Haland.\nA baseline as tall as Haland means that in this style the sentence was not needed.",
-    "cross_play": "Best responses of each style with partners of every style.\nA dark diagonal "
-    "means that knowing the partner's style pays; an even row means an ego that suits everyone.",
+    "cross_play": "Best responses to each style with held-out partners of every style: return, and "
+    "below it the share of the Oracle of the partner's style.\nA dark diagonal means that knowing "
+    "the partner's style pays; an even row means an ego that suits everyone.",
     "learning_curves": "Return in training: each seed (grey), their mean and one standard "
     "deviation.\nA curve that stays low is a partner that did not learn, and makes an Oracle that "
     "says little.",
@@ -74,6 +81,7 @@ def write_report(results: Mapping[str, Any], folder: str | Path) -> Path:
         _headline(results),
         _gates(results),
         _by_style(results),
+        _worth(results, figures),
         _translator(results),
         _memorisation(results),
         _figures(figures),
@@ -146,7 +154,7 @@ def _verdict(results: Mapping[str, Any]) -> str:
 
 
 def _headline(results: Mapping[str, Any]) -> str:
-    meaning = {**_MEANING, **results.get("descriptions", {})}
+    meaning = {**_MEANING, **_universal(results), **results.get("descriptions", {})}
     rows = [(row.method, *_numbers(row), meaning.get(row.method, "")) for row in summarise(results)]
     head = ("method", "return", "return / Oracle", "episodes", "what it is")
     table = _table(head, rows, "lrrrl")
@@ -176,7 +184,7 @@ def _gates(results: Mapping[str, Any]) -> str:
 
 
 def _by_style(results: Mapping[str, Any]) -> str:
-    methods = [name for name in ordered_methods(results) if name in METHODS]
+    methods = [name for name in ordered_methods(results) if name in (*METHODS, *COMPARISONS)]
     tables = {name: (returns(results, name), ratios(results, name)) for name in methods}
     rows = []
     for index, style in enumerate(results["styles"]):
@@ -189,6 +197,23 @@ def _by_style(results: Mapping[str, Any]) -> str:
     table = _table(("style", *methods), rows, "l" + "r" * len(methods))
     note = "Return ± deviation over seeds; in brackets the share of the Oracle."
     return f"## By style\n\n{table}\n\n{note}"
+
+
+def _universal(results: Mapping[str, Any]) -> dict[str, str]:
+    """What the universal egos are, with the budget that they had."""
+    if not (trained := results.get("universal")):
+        return {}
+    what = (
+        "one feed-forward ego trained with the training partners of all styles "
+        f"({steps_in_words(trained['steps'])} steps), {{}} the style's label"
+    )
+    return {UNIVERSAL: what.format("without"), UNIVERSAL_WITH_LABEL: what.format("with")}
+
+
+def _worth(results: Mapping[str, Any], figures: Iterable[Path]) -> str:
+    shown = [_shown(file) for file in figures if file.stem == _WORTH_FIGURE]
+    parts = list(filter(None, [worth_of_the_style(results), *shown]))
+    return "\n\n".join(["## What the style is worth", *parts]) if parts else ""
 
 
 def _translator(results: Mapping[str, Any]) -> str:
@@ -219,11 +244,12 @@ def _memorisation(results: Mapping[str, Any]) -> str:
 
 
 def _figures(figures: Iterable[Path]) -> str:
-    shown = [
-        f"![{file.stem.replace('_', ' ')}](figures/{file.name})\n\n{_CAPTIONS[file.stem]}"
-        for file in figures
-    ]
+    shown = [_shown(file) for file in figures if file.stem != _WORTH_FIGURE]
     return "## Figures\n\n" + "\n\n".join(shown) if shown else ""
+
+
+def _shown(file: Path) -> str:
+    return f"![{file.stem.replace('_', ' ')}](figures/{file.name})\n\n{_CAPTIONS[file.stem]}"
 
 
 def _episodes(results: Mapping[str, Any], folder: Path) -> str:
@@ -262,10 +288,3 @@ def _with_spread(centre: float, deviation: float) -> str:
 
 def _number(value: Any) -> str:
     return f"{value:.3g}" if isinstance(value, float) else str(value)
-
-
-def _table(head: Sequence[str], rows: Iterable[Sequence[str]], alignment: str) -> str:
-    """A Markdown table; alignment has a letter a column, l or r."""
-    rule = ["---:" if letter == "r" else "---" for letter in alignment]
-    lines = [head, rule, *rows]
-    return "\n".join(f"| {' | '.join(cell.replace('|', '¦') for cell in line)} |" for line in lines)
