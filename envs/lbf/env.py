@@ -2,6 +2,7 @@
 
 import dataclasses
 import functools
+from types import ModuleType
 from typing import Any, ClassVar, Literal
 
 import jax
@@ -107,6 +108,13 @@ class Spread:
         if self.encoding == "flat":
             size = observation.flat_size(2, spread.NUM_FOODS)
         return Pair(size, size + spread.NUM_FOODS)
+
+    @property
+    def viewer(self) -> ModuleType:
+        """The module that draws the field; imported on first use, since play never needs it."""
+        from envs.lbf import viewer
+
+        return viewer
 
     def reset(self, key: jax.Array, style: Style) -> tuple[State, TimeStep]:
         """Starts a game: draws the foods' places and the players' cells near the centre.
