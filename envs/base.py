@@ -5,6 +5,7 @@ Functions are unbatched: callers `vmap` over games, styles and seeds. Nothing re
 itself, so a terminal observation is never mixed up with the first one of the next game.
 """
 
+from types import ModuleType
 from typing import Any, Literal, NamedTuple, Protocol
 
 import jax
@@ -84,4 +85,13 @@ class Environment(Protocol):
 
     def step(self, key: jax.Array, state: Any, actions: Pair, style: Any) -> tuple[Any, TimeStep]:
         """Plays one step; consumes `key`."""
+        ...
+
+
+class DrawnEnvironment(Environment, Protocol):
+    """An environment that can be drawn: what `envs.make` returns."""
+
+    @property
+    def viewer(self) -> ModuleType:
+        """Module with `draw_state(env, state, …)`, `save_gif(path, env, states, …)`, `save_png`."""
         ...

@@ -3,7 +3,7 @@
 from collections.abc import Callable
 from typing import Any
 
-from envs.base import Environment
+from envs.base import DrawnEnvironment
 from envs.lbf.env import make_lbf
 from envs.overcooked.env import make_overcooked
 from envs.overcooked.layouts import CLASSIC, STYLED
@@ -25,7 +25,7 @@ def names(*, styled_only: bool = False) -> tuple[str, ...]:
     return tuple(name for name in found if not (styled_only and name in classic))
 
 
-def make(name: str, **options) -> Environment:
+def make(name: str, **options) -> DrawnEnvironment:
     """Makes an environment, such as `overcooked/center_pots`.
 
     Args:

@@ -6,6 +6,7 @@ from typing import Any
 import jax
 import numpy as np
 
+from envs.base import DrawnEnvironment
 from experiments.progress import StageProgress
 from experiments.stages import Run, load_haland, load_population
 from haland_jax import rollout
@@ -54,7 +55,7 @@ def _at(tree: Any, index: Any) -> Any:
 
 
 def save_episode(
-    env: Any,
+    env: DrawnEnvironment,
     path: Path,
     game: Recording,
     style_name: str,
@@ -98,7 +99,7 @@ def _moments(game: Recording) -> int:
 
 
 def save_moment(
-    env: Any, path: Path, game: Recording, style_name: str, caption: str, *, step: int
+    env: DrawnEnvironment, path: Path, game: Recording, style_name: str, caption: str, *, step: int
 ) -> None:
     """Writes one moment of a game as a PNG and an SVG beside it; arguments as `save_episode`.
 
