@@ -9,6 +9,7 @@ from haland_jax.partners import PartnersConfig, refit_config
 from haland_jax.policy_vae import PolicyVAEConfig
 from haland_jax.ppo import PPOConfig
 from haland_jax.translator import TranslatorConfig
+from haland_jax.universal import UniversalConfig, universal_config
 
 DEFAULT_ENVIRONMENT = "overcooked/diverse_coordination"
 
@@ -76,7 +77,8 @@ class RunConfig:
         compression: policy VAE (stage 3).
         diffusion: latent diffusion (stage 4).
         translator: sentence translator (stage 5).
-        evaluation: what is measured (stage 6).
+        universal: egos for the partners of all styles, told the style or not (stage 6).
+        evaluation: what is measured (stage 7).
     """
 
     environment: str
@@ -89,6 +91,7 @@ class RunConfig:
     compression: CompressionConfig = dataclasses.field(default_factory=CompressionConfig)
     diffusion: DiffusionConfig = dataclasses.field(default_factory=DiffusionConfig)
     translator: TranslatorConfig = dataclasses.field(default_factory=TranslatorConfig)
+    universal: UniversalConfig = dataclasses.field(default_factory=UniversalConfig)
     evaluation: EvaluationConfig = dataclasses.field(default_factory=EvaluationConfig)
 
 
@@ -133,6 +136,9 @@ def smoke(environment: str, seed: int) -> RunConfig:
             fine_tuning=FitConfig(learning_rate=2e-4, steps=4, warmup_steps=1),
             translation=FitConfig(learning_rate=1e-4, steps=20, warmup_steps=5),
         ),
+        universal=UniversalConfig(
+            seeds=2, training=dataclasses.replace(refit, num_envs=16, shaping=3.0)
+        ),
         evaluation=EvaluationConfig(games=4, samples=1, batch=32),
     )
 
@@ -159,6 +165,7 @@ def quick(environment: str, seed: int) -> RunConfig:
             fit=FitConfig(learning_rate=1e-2, steps=1500, warmup_steps=50)
         ),
         diffusion=DiffusionConfig(clip=8.0, frequency_jitter=0.08),
+        universal=UniversalConfig(training=universal_config(1_500_000)),
     )
 
 
@@ -189,6 +196,7 @@ def overnight(environment: str, seed: int) -> RunConfig:
             frequency_jitter=0.08,
             fit=FitConfig(learning_rate=2e-3, steps=4000, warmup_steps=200, ema_decay=0.999),
         ),
+        universal=UniversalConfig(training=universal_config(10_000_000)),
         evaluation=EvaluationConfig(games=32),
     )
 
@@ -210,6 +218,9 @@ def paper(environment: str, seed: int) -> RunConfig:
             clip=8.0,
             frequency_jitter=0.08,
             fit=FitConfig(learning_rate=2e-3, steps=10_000, warmup_steps=200, ema_decay=0.999),
+        ),
+        universal=UniversalConfig(
+            seeds=3, training=universal_config(50_000_000, num_envs=320, num_minibatches=8)
         ),
         evaluation=EvaluationConfig(games=32, samples=4),
     )

@@ -21,9 +21,10 @@ from experiments.stages import (
     load_haland,
     load_population,
     load_task_language,
+    load_universal,
     load_vae,
 )
-from experiments.summary import BEST_RESPONSE, ORACLE
+from experiments.summary import BEST_RESPONSE, COMPARISONS, ORACLE
 from experiments.summary import HEADLINE as TEST_SENTENCES
 from experiments.summary import WRONG as WRONG_SENTENCE
 from haland_jax import partners, policy_vae
@@ -77,6 +78,9 @@ def evaluate(run: Run, task: StageProgress) -> dict[str, Any]:
     cross = cross_play(judge, next(keys), archive.egos.actor, held_out)
     right = nearest_is_right(haland, translated[TEST_SENTENCES])
     gate = policy_vae_gate(run, judge, next(keys))
+    for method, policies in zip(COMPARISONS, load_universal(run).values(), strict=True):
+        results[method] = judge.with_held_out(next(keys), policies, held_out).mean(axis=2)
+        task.update(task.done + 1)
     return {
         "methods": {
             method: {name: {"returns": by_style[i]} for i, name in enumerate(env.style_names)}

@@ -10,7 +10,19 @@ from matplotlib.axes import Axes
 from matplotlib.backends.backend_agg import FigureCanvasAgg
 from matplotlib.figure import Figure
 
-from experiments.summary import HEADLINE, METHODS, ORACLE, WRONG, mean, ratios, returns, spread
+from experiments.summary import (
+    HEADLINE,
+    METHODS,
+    ORACLE,
+    UNIVERSAL,
+    UNIVERSAL_WITH_LABEL,
+    WRONG,
+    mean,
+    ratios,
+    returns,
+    shares,
+    spread,
+)
 from experiments.summary import ordered_methods as methods_of
 
 _DOTS_PER_INCH = 150
@@ -38,14 +50,16 @@ _FILLS = {
     "Haland, training sentences": ("#8fc1e3", ""),
     HEADLINE: ("#2a6cb6", ""),
     WRONG: ("#ffffff", "////"),
+    UNIVERSAL: ("#c9d8c0", ""),
+    UNIVERSAL_WITH_LABEL: ("#6f8f6b", ""),
 }
 _OTHER_FILLS = (
     ("#e8b96a", ""),
     ("#b5651d", ""),
     ("#f6e3c0", ".."),
-    ("#c9d8c0", ""),
-    ("#6f8f6b", ""),
     ("#e6efe2", "xx"),
+    ("#9a7b4f", "//"),
+    ("#dccfe6", ".."),
     ("#c3a6cf", ""),
 )
 
@@ -179,25 +193,34 @@ def task_language(results: Mapping[str, Any]) -> Figure:
 
 
 def cross_play(results: Mapping[str, Any]) -> Figure:
-    """Return of the best responses of each style with partners of each style."""
-    values = np.asarray(results["cross_play"], float)
+    """Return of the best responses of each style with held-out partners of each style.
+
+    A cell also has the share of the Oracle of the partner's style, which colours it.
+    """
+    values = np.asarray(results["cross_play"], float)  # [ego's style, partner's style]
     styles = results["styles"]
-    figure = _figure(2.4 + 0.55 * len(styles), 1.9 + 0.42 * len(styles))
+    oracle = np.broadcast_to(returns(results, ORACLE).mean(axis=1), values.shape)
+    share = shares(values, oracle)
+    figure = _figure(2.6 + 0.62 * len(styles), 2.1 + 0.5 * len(styles))
     axes = figure.add_subplot()
-    lowest, highest = min(0.0, values.min()), values.max()
-    image = axes.imshow(values, cmap="Blues", vmin=lowest, vmax=highest, aspect="auto")
+    colours = matplotlib.colormaps["Blues"].with_extremes(bad="#eeeeee")
+    image = axes.imshow(share, cmap=colours, vmin=0.0, vmax=1.0, aspect="auto")
     for (row, column), value in np.ndenumerate(values):
+        of_oracle = share[row, column]
+        shown = "–" if np.isnan(of_oracle) else f"{of_oracle:.0%}"
         axes.text(
-            column, row, f"{value:.0f}", ha="center", va="center", fontsize=8,
-            color="white" if value > lowest + 0.6 * (highest - lowest) else "black",
+            column, row, f"{value:.0f}\n{shown}", ha="center", va="center", fontsize=8,
+            color="white" if of_oracle > 0.6 else "black", linespacing=1.1,
             fontweight="bold" if row == column else "normal",
         )  # fmt: skip
     axes.set_yticks(range(len(styles)), [_words(style) for style in styles])
     _label_styles(axes, styles)
     _draw_cell_borders(axes, *values.shape)
-    axes.set_ylabel("ego trained for")
-    axes.set_xlabel("partner's style")
-    figure.colorbar(image, ax=axes, shrink=0.8, aspect=25, pad=0.02).set_label("return per episode")
+    axes.set_ylabel("ego: best response to the style")
+    axes.set_xlabel("held-out partners of the style")
+    bar = figure.colorbar(image, ax=axes, shrink=0.8, aspect=25, pad=0.02)
+    bar.set_label("share of the Oracle of the partner's style")
+    bar.outline.set_linewidth(0.6)  # pyright: ignore[reportCallIssue]
     return figure
 
 
@@ -278,7 +301,7 @@ FIGURES: dict[str, tuple[tuple[str, ...], Callable[[Mapping[str, Any]], Figure |
     "share_of_oracle": (("methods", "oracle"), share_of_oracle),
     "returns_by_style": (("methods", "oracle"), returns_by_style),
     "comparisons_by_style": (("methods", "oracle"), comparisons_by_style),
-    "cross_play": (("cross_play",), cross_play),
+    "cross_play": (("cross_play", "oracle"), cross_play),
     "learning_curves": (("curves",), learning_curves),
     "task_language": (("task_language",), task_language),
 }

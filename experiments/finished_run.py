@@ -7,11 +7,11 @@ from typing import Any
 from experiments.configs import PRESETS, RunConfig
 from experiments.errors import UserError, as_user_error
 from experiments.run_folder import RunFolder, to_json
-from experiments.stages import STAGES, Run
+from experiments.stages import POLICY_STAGES, Run
 
 
 def open_run(path: Path) -> Run:
-    """Opens a run whose stages are all finished.
+    """Opens a run whose policy-making stages are all finished.
 
     Args:
         path: the run folder.
@@ -19,7 +19,7 @@ def open_run(path: Path) -> Run:
     Raises:
         UserError: there is no finished run, or it was made by another version's preset.
     """
-    folder = RunFolder.read(path, tuple(STAGES))
+    folder = RunFolder.read(path, POLICY_STAGES)
     with as_user_error():
         return Run(_configuration(path, folder.configuration), folder)
 

@@ -18,7 +18,7 @@ from experiments.run_folder import RunFolder
 from experiments.stages import STAGES, Run
 
 EVALUATION, REPORT = "evaluation", "report"
-NUM_METHODS = 6
+NUM_METHODS = 8
 
 
 def run_pipeline(config: RunConfig, path: Path) -> dict[str, Any]:
@@ -77,6 +77,7 @@ def collect_results(run: Run) -> dict[str, Any]:
             "steps": metrics["partners"]["curve_steps"],
             "returns": metrics["partners"]["curve_returns"],
         },
+        "universal": _universal(run, metrics["universal"]),
         "partners": {
             name: metrics["partners"][name]
             for name in ("joint_returns", "kept_for_training", "kept_held_out")
@@ -84,6 +85,16 @@ def collect_results(run: Run) -> dict[str, Any]:
         "times": {name: values["seconds"] for name, values in metrics.items()},
         "machine": describe_machine(),
     }
+
+
+def _universal(run: Run, measured: dict[str, Any]) -> dict[str, Any]:
+    """How the universal egos learnt, and what the best responses cost beside them."""
+    config = run.config.partners
+    styles = len(run.env.style_names)
+    pairs = styles * config.num_seeds * config.joint.num_updates * config.joint.steps_per_update
+    refits = styles * config.train_seeds * config.refit.num_updates * config.refit.steps_per_update
+    kept = ("steps", "seeds", "curve_steps", "curve_returns")
+    return {**{name: measured[name] for name in kept}, "best_response_steps": pairs + refits}
 
 
 def describe_machine() -> dict[str, Any]:
@@ -113,6 +124,7 @@ def _totals(config: RunConfig) -> dict[str, int]:
         "policy_vae": config.compression.fit.steps,
         "diffusion": config.diffusion.fit.steps,
         "translator": translator.fine_tuning.steps + translator.translation.steps,
+        "universal": config.universal.training.num_updates,
     }
 
 

@@ -17,6 +17,8 @@ ORACLE = "Oracle"
 BEST_RESPONSE = "Best response"
 HEADLINE = "Haland, test sentences"
 WRONG = "Haland, wrong sentence"
+UNIVERSAL = "Universal ego"
+UNIVERSAL_WITH_LABEL = "Universal ego with the style's label"
 METHODS = (
     ORACLE,
     BEST_RESPONSE,
@@ -26,6 +28,9 @@ METHODS = (
     HEADLINE,
     WRONG,
 )
+"""The method itself, step by step."""
+COMPARISONS = (UNIVERSAL, UNIVERSAL_WITH_LABEL)
+"""What else every run measures."""
 
 
 @dataclasses.dataclass(frozen=True)
@@ -41,11 +46,12 @@ class MethodSummary:
 
 
 def ordered_methods(results: Mapping[str, Any]) -> list[str]:
-    """The methods that were measured: the paper's chain in its order, then any others."""
-    measured = [name for name in METHODS if name in results["methods"]]
+    """The methods that were measured: the paper's chain, the comparisons, then any others."""
+    known = (*METHODS, *COMPARISONS)
+    measured = [name for name in known if name in results["methods"]]
     if ORACLE not in measured:
         measured.insert(0, ORACLE)
-    return measured + [name for name in results["methods"] if name not in METHODS]
+    return measured + [name for name in results["methods"] if name not in known]
 
 
 def returns(results: Mapping[str, Any], method: str) -> np.ndarray:

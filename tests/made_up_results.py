@@ -22,6 +22,7 @@ SHARES = {
     "Haland, test sentences": 0.92,
     "Haland, wrong sentence": 0.35,
 }
+UNIVERSAL_SHARES = {"Universal ego": 0.7, "Universal ego with the style's label": 0.78}
 
 
 def made_up_results(others: tuple[str, ...] = ()) -> dict[str, Any]:
@@ -39,7 +40,7 @@ def made_up_results(others: tuple[str, ...] = ()) -> dict[str, Any]:
             for style in STYLES
         }
 
-    methods = {name: method(share) for name, share in SHARES.items()}
+    methods = {name: method(share) for name, share in (SHARES | UNIVERSAL_SHARES).items()}
     methods |= {name: method(0.8 * random.random()) for name in others}
     events = [
         f"{player}:{event}"
@@ -79,5 +80,6 @@ def made_up_results(others: tuple[str, ...] = ()) -> dict[str, Any]:
         },
         "task_language": {"events": events, "v_hat": random.random((8, len(events))).tolist()},
         "cross_play": (60 + 60 * random.random((8, 8)) + 60 * np.eye(8)).tolist(),
+        "universal": {"steps": 1_500_000, "seeds": 1, "best_response_steps": 52_800_000},
         "memorisation": {"nearest training latent distance": 3.2, "between training latents": 7.9},
     }

@@ -5,7 +5,7 @@ import itertools
 import matplotlib
 import numpy as np
 import pytest
-from made_up_results import SHARES, STYLES, made_up_results
+from made_up_results import SHARES, STYLES, UNIVERSAL_SHARES, made_up_results
 from matplotlib._pylab_helpers import Gcf
 from PIL import Image
 
@@ -72,6 +72,14 @@ def test_only_what_was_measured_is_drawn(tmp_path):
     for key in ("curves", "task_language", "cross_play"):
         del results[key]
     drawn = figures.draw_figures(results, tmp_path)
+    assert [file.stem for file in drawn] == [
+        "share_of_oracle",
+        "returns_by_style",
+        "comparisons_by_style",
+    ]
+    for method in UNIVERSAL_SHARES:
+        del results["methods"][method]
+    drawn = figures.draw_figures(results, tmp_path)
     assert [file.stem for file in drawn] == ["share_of_oracle", "returns_by_style"]
 
 
@@ -83,7 +91,9 @@ def test_a_run_that_learnt_nothing_is_still_drawn(tmp_path):
             method[style]["returns"] = [[0.0]]
     results["cross_play"] = np.zeros((8, 8)).tolist()
     del results["curves"], results["task_language"]
-    assert len(figures.draw_figures(results, tmp_path)) == 3
+    assert len(figures.draw_figures(results, tmp_path)) == 4
+    cells = figures.cross_play(results).axes[0].texts
+    assert {cell.get_text() for cell in cells} == {"0\n–"}
 
 
 def test_the_bars_are_as_tall_as_the_returns():
@@ -103,8 +113,30 @@ def test_the_labels_of_the_heatmaps_do_not_overlap():
         for axes in figure.axes[:-1]:
             boxes = [label.get_window_extent() for label in axes.get_yticklabels()]
             assert all(not a.overlaps(b) for a, b in itertools.pairwise(boxes))
-    values = [float(text.get_text()) for text in figure.axes[0].texts]
-    np.testing.assert_allclose(values, np.ravel(results["cross_play"]), atol=0.5)
+
+
+def test_cross_play_is_shown_as_return_and_as_share_of_the_partners_oracle():
+    results = made_up_results()
+    axes = figures.cross_play(results).axes[0]
+    cells = [text.get_text().split("\n") for text in axes.texts]
+    values = np.asarray(results["cross_play"])
+    oracle = np.array([np.mean(results["oracle"][style]) for style in STYLES])
+    np.testing.assert_allclose([float(v) for v, _ in cells], values.ravel(), atol=0.5)
+    # Columns are partners: each is divided by its own style's Oracle.
+    shares = np.array([float(share.rstrip("%")) / 100 for _, share in cells]).reshape(8, 8)
+    np.testing.assert_allclose(shares, values / oracle[None, :], atol=0.006)
+    np.testing.assert_allclose(axes.images[0].get_array(), values / oracle[None, :])
+    assert [text.get_fontweight() == "bold" for text in axes.texts] == list(np.eye(8).ravel() == 1)
+
+
+def test_the_comparisons_stand_beside_the_oracle_and_haland():
+    labels = [
+        text.get_text()
+        for text in figures.comparisons_by_style(made_up_results(("General",)))  # pyright: ignore
+        .legends[0]
+        .get_texts()
+    ]
+    assert labels == ["Oracle", "Haland, test sentences", *UNIVERSAL_SHARES, "General"]
 
 
 def test_a_heatmap_cell_holds_its_own_event_and_style():

@@ -8,6 +8,7 @@ import pytest
 ROOT = Path(__file__).parent.parent
 PACKAGES = ("envs", "haland_jax", "experiments")
 ORDER = (
+    "configuration",
     "fit",
     "checkpoint",
     "networks",
@@ -16,6 +17,7 @@ ORDER = (
     "ppo_loss",
     "ppo",
     "partners",
+    "universal",
     "baselines",
     "task_language",
     "hypernetwork",
@@ -26,6 +28,8 @@ ORDER = (
     "bert_weights",
     "translator",
     "deployment",
+    "compact",
+    "pretrained",
     "ablations",
 )
 FORBIDDEN = {"utils", "util", "helpers", "helper", "common", "misc", "manager"}

@@ -16,6 +16,7 @@ from test_commands import refused
 from experiments import configs, devices, evaluate, evaluation, generate, run, training
 from experiments.pipeline import run_pipeline
 from experiments.stages import STAGES
+from haland_jax.universal import VARIANTS
 
 pytestmark = [pytest.mark.slow, pytest.mark.timeout(1500)]
 
@@ -27,6 +28,7 @@ METHODS = {
     evaluation.TRAINING_SENTENCES,
     evaluation.TEST_SENTENCES,
     evaluation.WRONG_SENTENCE,
+    *evaluation.COMPARISONS,
 }
 
 
@@ -64,6 +66,10 @@ def test_results_hold_every_method_style_and_held_out_seed(results):
         assert len(results["partners"]["joint_returns"][style]) == config.num_seeds
         curve = np.shape(results["curves"]["returns"][style])
         assert curve == (config.num_seeds, len(results["curves"]["steps"]))
+    universal = results["universal"]
+    assert universal["steps"] == 640
+    for variant in VARIANTS:
+        assert np.shape(universal["curve_returns"][variant]) == (2, len(universal["curve_steps"]))
     assert {"value", "bar", "met"} <= set(next(iter(results["gates"].values())))
     assert np.isfinite(numbers(results)).all()
 
@@ -193,7 +199,7 @@ def lasting(results: dict) -> dict:
     return json.loads(json.dumps(kept))
 
 
-def test_a_run_killed_twice_ends_with_the_results_of_an_uninterrupted_one(
+def test_a_run_killed_thrice_ends_with_the_results_of_an_uninterrupted_one(
     monkeypatch, smoke_run, tmp_path
 ):
     monkeypatch.setattr(training, "SECONDS_BETWEEN_CHECKPOINTS", 0.0)
@@ -202,6 +208,7 @@ def test_a_run_killed_twice_ends_with_the_results_of_an_uninterrupted_one(
     path = tmp_path / "interrupted"
     run_until_killed(monkeypatch, config, path, "partners/unfinished")
     run_until_killed(monkeypatch, config, path, "policy_vae/unfinished")
+    run_until_killed(monkeypatch, config, path, "universal/unfinished")
     partners_done = (path / "partners" / "metrics.json").stat().st_mtime_ns
     run_pipeline(config, path)
     assert (path / "partners" / "metrics.json").stat().st_mtime_ns == partners_done

@@ -2,6 +2,7 @@
 
 import re
 
+import numpy as np
 import pytest
 from made_up_results import STYLES, made_up_results
 from rich.console import Console
@@ -11,11 +12,11 @@ from experiments import report, summary
 
 @pytest.fixture(autouse=True)
 def no_drawing(monkeypatch):
-    """The figures have their own test; here only their names matter."""
+    """The figures have their own tests; here only their names matter."""
 
     def name_only(results, folder):
         folder.mkdir(exist_ok=True)
-        return [folder / "returns_by_style.png"]
+        return [folder / "returns_by_style.png", folder / "cross_play.png"]
 
     monkeypatch.setattr(report, "draw_figures", name_only)
 
@@ -40,6 +41,54 @@ def test_the_report_holds_the_numbers(tmp_path):
     assert "| nearest training latent distance | 3.2 |" in text
 
 
+def section(text: str, title: str) -> str:
+    return text.split(f"## {title}\n\n")[1].split("\n## ")[0]
+
+
+def with_shares(results: dict, shares: dict[str, float]) -> dict:
+    """The results with methods that earn a fixed share of each partner's Oracle."""
+    for method, factor in shares.items():
+        for style in STYLES:
+            results["methods"][method][style]["returns"] = [
+                [factor * value] for value in results["oracle"][style]
+            ]
+    return results
+
+
+@pytest.mark.parametrize(
+    ("told", "haland", "expected"),
+    [
+        (0.8, 0.9, ("the label is worth something", "(90%) is 10% of the Oracle ahead of")),
+        (0.61, 0.5, ("hardly changes", "(50%) is 11% of the Oracle behind")),
+        (0.4, 0.9, ("optimisation, not information", "(90%) is 30% of the Oracle ahead of")),
+    ],
+)
+def test_what_the_style_is_worth_is_said_in_words(tmp_path, told, haland, expected):
+    shares = {
+        summary.UNIVERSAL: 0.6,
+        summary.UNIVERSAL_WITH_LABEL: told,
+        summary.HEADLINE: haland,
+    }
+    results = with_shares(made_up_results(), shares)
+    results["cross_play"] = (np.full((8, 8), 50.0) + 150 * np.eye(8)).tolist()
+    said = section(report.write_report(results, tmp_path).read_text(), "What the style is worth")
+    assert "200.0 with held-out partners of their own style" in said
+    assert "50.0 with those of other styles, 25% of that." in said
+    assert "for 1.5 M steps" in said
+    assert "(60% of the Oracle) without the style's label" in said
+    assert f"({told:.0%}) with it; all archived best responses together took 52.8 M" in said
+    for phrase in expected:
+        assert phrase in said
+    assert "![cross play](figures/cross_play.png)" in said
+
+
+def test_the_universal_egos_are_listed_with_their_budget(tmp_path):
+    text = report.write_report(made_up_results(), tmp_path).read_text()
+    line = next(line for line in text.splitlines() if line.startswith("| Universal ego |"))
+    assert "(1.5 M steps), without the style's label" in line
+    assert "| Universal ego with the style's label |" in section(text, "By style").split("\n")[0]
+
+
 @pytest.mark.parametrize(
     ("share", "wrong", "expected"),
     [
@@ -48,12 +97,7 @@ def test_the_report_holds_the_numbers(tmp_path):
     ],
 )
 def test_the_verdict_follows_the_numbers(tmp_path, share, wrong, expected):
-    results = made_up_results()
-    for method, factor in ((summary.HEADLINE, share), (summary.WRONG, wrong)):
-        for style in STYLES:
-            results["methods"][method][style]["returns"] = [
-                [factor * value] for value in results["oracle"][style]
-            ]
+    results = with_shares(made_up_results(), {summary.HEADLINE: share, summary.WRONG: wrong})
     text = report.write_report(results, tmp_path).read_text()
     for phrase in expected:
         assert phrase in text.split("## Returns")[0]
@@ -70,7 +114,8 @@ def test_parts_that_were_not_measured_are_left_out(tmp_path):
     results = made_up_results()
     for key in ("gates", "translator", "times", "machine", "memorisation"):
         del results[key]
-    del results["methods"][summary.HEADLINE]
+    for method in (summary.HEADLINE, *summary.COMPARISONS):
+        del results["methods"][method]
     text = report.write_report(results, tmp_path).read_text()
     assert "was not measured from test sentences" in text
     for title in ("Gates", "Translator", "Time", "Machine", "Memorisation", "Episodes"):

@@ -4,6 +4,7 @@ A stage is a function of a `Run` and its progress; it saves its result as a chec
 the matching `load_…` restores, and returns metrics.
 """
 
+from experiments.stages.context import POLICY_STAGES as POLICY_STAGES
 from experiments.stages.context import STAGE_NAMES as STAGE_NAMES
 from experiments.stages.context import Run as Run
 from experiments.stages.model import fit_diffusion, fit_policy_vae, fit_translator
@@ -13,6 +14,8 @@ from experiments.stages.population import load_archive as load_archive
 from experiments.stages.population import load_population as load_population
 from experiments.stages.population import load_task_language as load_task_language
 from experiments.stages.population import make_best_responses, make_partners, make_task_language
+from experiments.stages.universal import load_universal as load_universal
+from experiments.stages.universal import train_universal
 
 STAGES = dict(
     zip(
@@ -24,6 +27,7 @@ STAGES = dict(
             fit_policy_vae,
             fit_diffusion,
             fit_translator,
+            train_universal,
         ),
         strict=True,
     )

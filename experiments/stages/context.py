@@ -18,7 +18,10 @@ STAGE_NAMES = (
     "policy_vae",
     "diffusion",
     "translator",
+    "universal",
 )
+POLICY_STAGES = STAGE_NAMES[: STAGE_NAMES.index("universal")]
+"""The stages that turning a sentence into a policy needs."""
 
 
 @dataclasses.dataclass

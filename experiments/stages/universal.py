@@ -1,0 +1,57 @@
+"""Universal egos, which say how much knowing the style is worth."""
+
+import itertools
+from typing import Any
+
+import jax
+import numpy as np
+
+from envs.labelled import Labelled
+from experiments.progress import StageProgress
+from experiments.stages.context import Run
+from experiments.stages.population import load_population
+from experiments.training import Saver, train_population
+from haland_jax import checkpoint, universal
+from haland_jax.networks import Policy
+
+CURVE_POINTS = 40
+
+
+def train_universal(run: Run, task: StageProgress) -> dict[str, Any]:
+    """Stage 6: trains egos with the training partners of all styles, told the style or not."""
+    config, env = run.config.universal, Labelled(run.env)
+    partners = load_population(run).train_partners
+    key = run.key("universal")
+    state, rewards = train_population(
+        env,
+        config.training,
+        lambda: universal.init_universal(env, config, key, partners),
+        universal.member_styles(env, config.seeds),
+        Saver(run.path("universal", "unfinished")),
+        task.update,
+        "universal egos",
+    )
+    checkpoint.save(run.path("universal", "egos"), state.ego.actor)
+    points = np.linspace(0, len(rewards), min(CURVE_POINTS, len(rewards)) + 1).astype(int)
+    smooth = np.array([rewards[a:b].mean(axis=0) for a, b in itertools.pairwise(points)])
+    smooth *= env.max_steps
+    curves = smooth.reshape(len(smooth), len(universal.VARIANTS), -1)  # [point, variant, seed]
+    return {
+        "steps": config.training.num_updates * config.training.steps_per_update,
+        "seeds": config.seeds,
+        "curve_steps": points[1:] * config.training.steps_per_update,
+        "curve_returns": {
+            name: curves[:, index].T for index, name in enumerate(universal.VARIANTS)
+        },
+    }
+
+
+def load_universal(run: Run) -> dict[str, Policy]:
+    """By variant, the policies for each style, leading axes [style, seed]."""
+    config, env = run.config.universal, Labelled(run.env)
+    partners = load_population(run).train_partners
+    shapes = jax.eval_shape(
+        lambda key: universal.init_universal(env, config, key, partners), jax.random.key(0)
+    )
+    egos = checkpoint.restore(run.path("universal", "egos"), shapes.ego.actor)
+    return universal.policies_by_style(env, egos)

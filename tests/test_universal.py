@@ -1,0 +1,269 @@
+"""Universal egos: who plays with whom in which style, who is told what, and that they learn."""
+
+import dataclasses
+from functools import partial
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+from toy_game import ToyGame, always
+
+from envs.base import Pair
+from envs.labelled import Labelled, LabelledStyle
+from experiments import configs, training
+from haland_jax import networks, partners, ppo, rollout, universal
+from haland_jax.ppo import PPOConfig, StylesByGame
+from haland_jax.universal import UniversalConfig
+
+TINY = PPOConfig(
+    total_steps=80, num_envs=8, rollout_steps=5, num_minibatches=2, epochs=1, confined_until=0.0
+)
+CONFIG = UniversalConfig(seeds=2, training=TINY)
+
+
+@dataclasses.dataclass(frozen=True)
+class HiddenPreference(ToyGame):
+    """A step pays 1 where the ego's action is 0 in the style `short`, 2 in the style `long`.
+
+    The ego cannot see which it is: told nothing it earns half of the steps at best.
+    """
+
+    style_names: tuple[str, ...] = ("short", "long")
+
+    def reset(self, key, style):
+        state, timestep = super().reset(key, style)
+        return state, self._blind(timestep)
+
+    def step(self, key, state, actions, style):
+        state, timestep = super().step(key, state, actions, style)
+        wanted = jnp.where(style.length == 3, 0, 2)
+        reward = (actions.ego == wanted).astype(jnp.float32)
+        return state, self._blind(timestep.replace(reward=reward))
+
+    @staticmethod
+    def _blind(timestep):
+        ego, partner = timestep.observation
+        return timestep.replace(observation=Pair(jnp.zeros_like(ego), partner))
+
+
+def frozen_partners(actions: list[list[int]]):
+    """Partners that always play these actions, leading axes [style, seed]."""
+    rows = [
+        jax.tree.map(lambda *leaves: jnp.stack(leaves), *[always(a, 2, 4, 64) for a in row])
+        for row in actions
+    ]
+    return jax.tree.map(lambda *leaves: jnp.stack(leaves), *rows)
+
+
+def train(env, config, members, updates):
+    return partners.compile_training(env, config.training, updates)(
+        members, universal.member_styles(env, config.seeds)
+    )
+
+
+def test_the_ego_sees_the_label_and_everything_else_stays():
+    game = ToyGame()
+    env = Labelled(game)
+    for index, name in enumerate(game.style_names):
+        style = env.style(name)
+        for leaf, stacked in zip(jax.tree.leaves(style), jax.tree.leaves(env.styles), strict=True):
+            np.testing.assert_array_equal(leaf, stacked[index])
+        state, first = env.reset(jax.random.key(0), style)
+        _, later = env.step(jax.random.key(1), state, Pair(jnp.int32(2), jnp.int32(0)), style)
+        plain_state, plain_first = game.reset(jax.random.key(0), style.style)
+        _, plain_later = game.step(
+            jax.random.key(1), plain_state, Pair(jnp.int32(2), jnp.int32(0)), style.style
+        )
+        for labelled, plain in ((first, plain_first), (later, plain_later)):
+            seen = np.concatenate([plain.observation.ego, np.eye(2)[index]])
+            np.testing.assert_array_equal(labelled.observation.ego, seen)
+            np.testing.assert_array_equal(labelled.observation.partner, plain.observation.partner)
+            assert labelled.reward == plain.reward
+        assert env.observation_sizes == Pair(5, 4)
+    assert bool(env.confine(env.style("long")).style.bound)
+    np.testing.assert_array_equal(env.hidden_styles.label, np.zeros((2, 2)))
+
+
+def test_each_game_has_its_partners_style():
+    # The partner's action pays: the short style's partners play 1 and 0, the long style's 0 and 1.
+    env = Labelled(ToyGame(ego_weight=0.0, partner_weight=1.0))
+    config = UniversalConfig(seeds=1, training=TINY)
+    state = universal.init_universal(
+        env, config, jax.random.key(0), frozen_partners([[1, 0], [0, 1]])
+    )
+    one, styles = jax.tree.map(lambda leaf: leaf[1], (state, universal.member_styles(env, 1)))
+    np.testing.assert_array_equal(one.observations.ego[:, 3:], np.repeat(np.eye(2), 4, axis=0))
+    _, steps = jax.jit(lambda *given: ppo._rollout(env, TINY, *given, 0.0))(
+        one, styles, jax.random.key(1)
+    )
+    # Games 0 to 3 are short ones and end every third step; games 4 to 7 end with the fifth.
+    ended = np.asarray(steps["ended"])
+    np.testing.assert_array_equal(ended[:, :4], np.tile([[0], [0], [1], [0], [0]], 4))
+    np.testing.assert_array_equal(ended[:, 4:], np.tile([[0], [0], [0], [0], [1]], 4))
+    np.testing.assert_array_equal(steps["reward"], np.tile([1, 1, 0, 0, 0, 0, 1, 1], (5, 1)))
+    # Restarted games keep their style.
+    labels = np.broadcast_to(np.repeat(np.eye(2), 4, axis=0), (5, 8, 2))
+    np.testing.assert_array_equal(steps["observations"].ego[..., 3:], labels)
+
+
+def test_a_style_for_all_games_and_the_same_style_by_game_play_alike():
+    game = ToyGame(ego_weight=1.0)
+    twice = jax.tree.map(lambda leaf: jnp.stack([leaf, leaf]), game.style("long"))
+    actors, critic = ppo.make_networks(game)
+    ego = ppo.init_learner(jax.random.key(0), actors.ego, critic, 3, TINY)
+    frozen = partners.flatten(frozen_partners([[0], [1]]))
+    found = []
+    for style in (game.style("long"), StylesByGame(twice)):
+        state = ppo.init_train_state(game, TINY, jax.random.key(1), ego, frozen, style)
+        _, metrics = jax.jit(partial(ppo.train_chunk, game, TINY, 1))(state, style)
+        found.append(float(metrics["reward"][0]))
+    assert found[0] == pytest.approx(found[1], rel=1e-6)
+
+
+def test_a_minibatch_has_games_of_all_styles(monkeypatch):
+    # A batch whose observations are the numbers of its games.
+    seen = []
+
+    def watched_loss(params, batch, *_):
+        jax.debug.callback(lambda games: seen.append(np.unique(games)), batch.observation)
+        return sum(jnp.sum(leaf) for leaf in jax.tree.leaves(params))
+
+    monkeypatch.setattr(ppo, "ppo_loss", watched_loss)
+    leaf = jnp.broadcast_to(jnp.arange(8.0), (5, 8))
+    batch = ppo.Batch(leaf, leaf, leaf, leaf, leaf, leaf)
+    learner = ppo.learner_from({"w": jnp.zeros(2)}, {"w": jnp.zeros(2)}, TINY)
+    for strided in (False, True):
+        learn = partial(ppo._learn, TINY, None, None, learner, batch, strided=strided)
+        jax.block_until_ready(learn(learning_rate=jnp.ones(()), entropy_weight=jnp.ones(())))
+    jax.effects_barrier()
+    assert sorted(map(tuple, seen[:2])) == [(0, 1, 2, 3), (4, 5, 6, 7)]
+    assert sorted(map(tuple, seen[2:])) == [(0, 2, 4, 6), (1, 3, 5, 7)]
+
+
+def test_both_variants_of_a_seed_start_alike_and_only_one_is_told():
+    env = Labelled(ToyGame())
+    state = universal.init_universal(env, CONFIG, jax.random.key(0), frozen_partners([[0], [1]]))
+    kernel = np.asarray(state.ego.actor["params"]["dense_0"]["kernel"])
+    np.testing.assert_array_equal(kernel[:2], kernel[2:])
+    assert (kernel[0] != kernel[1]).any()
+    labels = np.asarray(state.observations.ego[..., 3:])
+    assert (labels[:2] == 0).all()
+    np.testing.assert_array_equal(labels[2:].sum(axis=-1), 1)
+    trained, _ = train(env, CONFIG, state, 2)
+    moved = np.asarray(trained.ego.actor["params"]["dense_0"]["kernel"]) - kernel
+    # Without a label its weights learn nothing; with it they do.
+    assert (moved[:2, 3:] == 0).all()
+    assert (np.abs(moved[2:, 3:]).max(axis=(1, 2)) > 0).all()
+
+
+def test_a_folded_label_plays_as_the_told_ego():
+    key = jax.random.key(0)
+    policy = networks.MLPActor(3, (4, 4)).init(key, jnp.zeros(7))
+    policy = jax.tree.map(lambda leaf: leaf + 0.3, policy)
+    seen, label = jnp.array([0.2, -1.0, 0.5]), jnp.array([0.0, 0.0, 1.0, 0.0])
+    folded = universal.fold_label(policy, label)
+    assert folded["params"]["dense_0"]["kernel"].shape == (3, 4)
+    np.testing.assert_allclose(
+        networks.act(folded, seen), networks.act(policy, jnp.append(seen, label)), rtol=1e-5
+    )
+
+
+def test_partners_that_cannot_share_the_games_are_refused():
+    env, config = Labelled(ToyGame()), UniversalConfig(training=TINY)
+    with pytest.raises(ValueError, match="is 8; expected a multiple of the 6 training partners"):
+        universal.init_universal(
+            env, config, jax.random.key(0), frozen_partners([[0, 1, 0], [1, 0, 1]])
+        )
+
+
+@pytest.mark.parametrize("preset", configs.PRESETS)
+def test_the_presets_share_the_games_of_eight_styles_in_equal_parts(preset):
+    config = configs.PRESETS[preset]("overcooked/crossway", 0)
+    count = 8 * config.partners.train_seeds
+    assert config.universal.training.num_envs % count == 0
+    # No more minibatches than games of a pair of partners: each has games of every style.
+    assert config.universal.training.num_minibatches * count <= (
+        2 * config.universal.training.num_envs
+    )
+
+
+def test_the_told_ego_learns_what_the_other_cannot():
+    game = HiddenPreference()
+    env = Labelled(game)
+    config = UniversalConfig(
+        training=PPOConfig(
+            total_steps=16 * 10 * 40,
+            num_envs=16,
+            rollout_steps=10,
+            num_minibatches=2,
+            learning_rate=2e-2,
+            entropy=0.0,
+            final_entropy=0.0,
+            reward_scale=1.0,
+            confined_until=0.0,
+        )
+    )
+    frozen = frozen_partners([[0], [1]])
+    state = universal.init_universal(env, config, jax.random.key(0), frozen)
+    state, _ = train(env, config, state, config.training.num_updates)
+    by_style = universal.policies_by_style(env, state.ego.actor)
+    assert tuple(by_style) == universal.VARIANTS
+    shares = {}
+    for variant, policies in by_style.items():
+        flat = partners.flatten(policies)
+        assert flat["params"]["dense_0"]["kernel"].shape == (2, 3, 64)
+        play = partners.compile_evaluation(game, 16)
+        games = play(
+            jax.random.split(jax.random.key(1), 2), flat, partners.flatten(frozen), game.styles
+        )
+        shares[variant] = np.asarray(games.returns.mean(axis=1) / game.styles.length)
+    assert shares["told the style"].min() > 0.9
+    # Whatever one action it prefers, it is wrong in one of the two styles.
+    assert shares["told nothing"].mean() < 0.6
+    # In the labelled environment the told ego earns the same.
+    told = jax.tree.map(lambda leaf: leaf[1], state.ego.actor)
+    labelled = rollout.play(
+        env, jax.random.key(2), told, always(0, 2, 4), env.style("long"), num_games=16
+    )
+    assert float(labelled.returns.mean()) / 5 > 0.9
+
+
+class Killed(BaseException):
+    """Stands for a process that dies."""
+
+
+def test_interrupted_training_ends_alike(monkeypatch, tmp_path):
+    env = Labelled(ToyGame())
+    config = dataclasses.replace(
+        CONFIG, training=dataclasses.replace(TINY, total_steps=200), seeds=1
+    )
+    assert config.training.num_updates == 5
+    frozen = frozen_partners([[0], [1]])
+
+    def run(path, die_after=None):
+        def report(done, metrics):
+            if done == die_after:
+                raise Killed
+
+        return training.train_population(
+            env,
+            config.training,
+            lambda: universal.init_universal(env, config, jax.random.key(0), frozen),
+            universal.member_styles(env, config.seeds),
+            training.Saver(path),
+            report,
+            "universal egos",
+        )
+
+    whole, rewards = run(tmp_path / "whole")
+    monkeypatch.setattr(training, "SECONDS_BETWEEN_CHECKPOINTS", 0.0)
+    monkeypatch.setattr(training, "UPDATES_PER_PIECE", 2)
+    with pytest.raises(Killed):
+        run(tmp_path / "resumed", die_after=4)
+    assert (tmp_path / "resumed").exists()
+    resumed, resumed_rewards = run(tmp_path / "resumed")
+    np.testing.assert_allclose(resumed_rewards, rewards, rtol=1e-6)
+    for one, two in zip(jax.tree.leaves(whole.ego), jax.tree.leaves(resumed.ego), strict=True):
+        np.testing.assert_allclose(one, two, rtol=1e-5, atol=1e-6)
+    assert isinstance(env.styles, LabelledStyle)
