@@ -10,14 +10,15 @@ from experiments.summary import (
     BEST_RESPONSE,
     HEADLINE,
     ORACLE,
+    UNIVERSAL,
+    UNIVERSAL_WITH_LABEL,
     WRONG,
     mean,
     ratios,
     returns,
     summarise,
 )
-
-UNIVERSAL, UNIVERSAL_WITH_LABEL = "Universal ego", "Universal ego with the style's label"
+from experiments.worth import worth_of_the_style
 
 
 @dataclasses.dataclass(frozen=True)
@@ -43,6 +44,7 @@ class Overview:
         universal_with_label: return of one ego for all styles, which is told the style.
         diagonal: return of best responses with partners of their own style.
         off_diagonal: return of best responses with partners of the other styles.
+        worth: what knowing the style is worth, in sentences; may be empty.
         minutes: all stages together.
         gates_met: how many gates were met.
         gates: how many there are.
@@ -68,11 +70,27 @@ class Overview:
     universal_with_label: float | None
     diagonal: float | None
     off_diagonal: float | None
+    worth: str
     minutes: float | None
     gates_met: int
     gates: int
     machine: str | None
     date: str | None
+
+    def amount(self, value: float | None) -> str:
+        """A return of this environment for a reader; a dash for what was not measured."""
+        return number(value, self._digits)
+
+    def amount_with_spread(self, value: tuple[float, float] | None) -> str:
+        """A return ± its deviation over held-out seeds; one seed has no deviation."""
+        if value is None or self.held_out_seeds == 1:
+            return self.amount(value[0] if value else None)
+        return f"{self.amount(value[0])} ± {self.amount(value[1])}"
+
+    @property
+    def _digits(self) -> int:
+        """Where an episode earns at most a few points, whole numbers say too little."""
+        return 0 if self.oracle[0] >= 10 else 2
 
 
 def overview(results: Mapping[str, Any]) -> Overview:
@@ -108,6 +126,7 @@ def overview(results: Mapping[str, Any]) -> Overview:
         ),
         diagonal=diagonal,
         off_diagonal=off_diagonal,
+        worth=worth_of_the_style(results),
         minutes=sum(times.values()) / 60 if times else None,
         gates_met=sum(bool(gate["met"]) for gate in gates.values()),
         gates=len(gates),
@@ -124,13 +143,6 @@ def number(value: float | None, digits: int = 0) -> str:
 def percent(value: float | None) -> str:
     """The share in per cent; a dash for what was not measured."""
     return "–" if value is None else f"{value:.0%}"
-
-
-def with_spread(value: tuple[float, float] | None, seeds: int) -> str:
-    """Mean ± deviation over seeds; one seed has no deviation."""
-    if value is None:
-        return "–"
-    return f"{value[0]:.0f} ± {value[1]:.0f}" if seeds > 1 else f"{value[0]:.0f}"
 
 
 def _share(results: Mapping[str, Any], method: str) -> float | None:

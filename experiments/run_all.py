@@ -22,7 +22,7 @@ from rich.table import Table
 import envs
 from experiments.configs import PRESETS, RunConfig
 from experiments.errors import UserError, as_user_error, choose
-from experiments.overview import Overview, number, overview, percent, with_spread
+from experiments.overview import Overview, number, overview, percent
 from experiments.run_folder import RunFolder, to_json
 
 ALL = "all"
@@ -184,8 +184,8 @@ def outcome_table(outcomes: Sequence[Outcome]) -> Table:
 
 def _cells(row: Overview) -> list[str]:
     return [
-        with_spread(row.oracle, row.held_out_seeds),
-        number(row.upper_bound),
+        row.amount_with_spread(row.oracle),
+        row.amount(row.upper_bound),
         number(row.oracle_of_bound, 2),
         number(row.ceiling, 2),
         number(row.share, 2),

@@ -10,6 +10,7 @@ from pathlib import Path
 
 import jax
 import pytest
+from refused_command import refused
 from toy_game import ToyGame
 
 from experiments import configs, devices, evaluate, generate, run, training
@@ -28,25 +29,12 @@ def in_this_process(monkeypatch, tmp_path):
     monkeypatch.chdir(tmp_path)
 
 
-def refused(capsys, monkeypatch, command, *arguments) -> str:
-    """Runs a command that must end with one line on standard error; returns that line."""
-    monkeypatch.setattr(sys, "argv", [command.__name__, *map(str, arguments)])
-    with pytest.raises(SystemExit) as stopped:
-        command.main()
-    shown = capsys.readouterr()
-    assert stopped.value.code == 2, shown
-    assert shown.err.startswith("error: ")
-    assert shown.err.count("\n") == 1
-    assert shown.out == ""
-    return shown.err
-
-
 @pytest.mark.parametrize(
     ("arguments", "message"),
     [
         (("--env", "overcooked/crossways"), "unknown environment .*mean 'overcooked/crossway'"),
         (("--env", "overcooked/cramped_room"), "unknown environment 'overcooked/cramped_room'"),
-        (("--preset", "fast"), "unknown preset 'fast'; expected one of smoke, quick, paper"),
+        (("--preset", "fast"), "unknown preset 'fast'; expected one of smoke, quick, overnight, paper"),
         (("--seed", "-1"), "seed is -1; expected 0 or more"),
     ],
 )

@@ -11,7 +11,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 from PIL import Image
-from test_commands import refused
+from refused_command import refused
 
 from experiments import configs, devices, evaluate, evaluation, generate, run, training
 from experiments.pipeline import run_pipeline

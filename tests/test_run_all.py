@@ -17,8 +17,8 @@ from pathlib import Path
 
 import pytest
 from made_up_results import made_up_results
+from refused_command import refused
 from rich.console import Console
-from test_commands import refused
 
 import envs
 from experiments import configs, devices, run, run_all

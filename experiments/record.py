@@ -1,0 +1,229 @@
+"""Keeps what a reader needs of finished runs, and makes the page that compares them.
+
+    python -m experiments.record runs/*-overnight-0     record these runs in docs/results
+    python -m experiments.record                        make the pages anew, as after new remarks
+
+Each run goes to docs/results/<environment>/: results.json, report.md, the figures and one or two
+episodes. docs/results/README.md is made from all that is recorded there, and so is the table in
+the README between its two markers. Remarks by hand go to docs/results/remarks.md, which is
+included; everything else in that folder is written by this command.
+"""
+
+import dataclasses
+import io
+import json
+import os
+import re
+from collections.abc import Mapping, Sequence
+from pathlib import Path, PurePosixPath
+from typing import Any
+
+import tyro
+from PIL import Image
+from rich.console import Console
+
+from experiments import results_page
+from experiments.errors import UserError, main_guard
+from experiments.overview import Overview, overview
+from experiments.run_folder import RunFolder
+
+LIMIT_BYTES = 4_000_000
+EPISODES = 2
+_COLOURS = 128
+_MARKERS = ("<!-- results -->", "<!-- /results -->")
+_LINK = re.compile(r"\]\(([^)#:]+)\)")
+
+
+@dataclasses.dataclass(frozen=True)
+class Arguments:
+    """Record finished runs for readers: results, report, figures and a few episodes.
+
+    A run replaces what was recorded of its environment. Without runs, only the pages are made
+    anew from what is recorded.
+    """
+
+    runs: tyro.conf.Positional[tuple[Path, ...]] = ()
+    """Folders of finished runs, at most one for each environment."""
+    out: Path = Path("docs/results")
+    """Folder of the recorded results."""
+    readme: Path = Path("README.md")
+    """File whose table between the markers <!-- results --> and <!-- /results --> is written."""
+
+
+@main_guard
+def main() -> None:
+    """The command."""
+    arguments = tyro.cli(Arguments, prog="python -m experiments.record")
+    changed = record(arguments.runs, arguments.out, arguments.readme)
+    console = Console(highlight=False)
+    for path in changed:
+        console.print(f"written: {path}", soft_wrap=True)
+    if not changed:
+        console.print("nothing has changed")
+
+
+def record(runs: Sequence[Path], out: Path, readme: Path) -> list[Path]:
+    """Records the runs and makes the pages; everything is checked before anything is written.
+
+    Args:
+        runs: folders of finished runs.
+        out: folder of the recorded results.
+        readme: file with the two markers.
+
+    Returns:
+        The files that changed; empty if everything was up to date.
+
+    Raises:
+        UserError: a run is unfinished or too large, two are of one environment, nothing is
+            recorded, or the README lacks its markers.
+    """
+    _split_readme(readme)
+    recorded: dict[str, dict[PurePosixPath, bytes]] = {}
+    for path in runs:
+        environment, files = recorded_files(path)
+        if environment in recorded:
+            raise UserError(f"{path} is a second run of {environment}; record one of each")
+        recorded[environment] = files
+    changed = []
+    for environment, files in recorded.items():
+        folder = out / environment
+        changed += [f for f in _stale_pictures(folder, files) if _remove(f)]
+        changed += [folder / name for name, data in files.items() if _write(folder / name, data)]
+    overviews = read_overviews(out)
+    remarks = out / "remarks.md"
+    page = results_page.page(
+        overviews, remarks.read_text(encoding="utf-8") if remarks.is_file() else ""
+    )
+    changed += [out / "README.md"] if _write(out / "README.md", page.encode()) else []
+    before, after = _split_readme(readme)
+    table = results_page.short_table(overviews, _relative(out, readme.parent))
+    text = f"{before}{_MARKERS[0]}\n\n{table}\n\n{_MARKERS[1]}{after}"
+    return [*changed, readme] if _write(readme, text.encode()) else changed
+
+
+def recorded_files(path: Path) -> tuple[str, dict[PurePosixPath, bytes]]:
+    """What is kept of a run: its environment, and the content of each file.
+
+    Raises:
+        UserError: the run is unfinished, or its figures alone are larger than the limit.
+    """
+    folder = RunFolder.read(path, ("report",))
+    results = without_paths(folder.read_json("results.json"))
+    report = path / "report.md"
+    if not report.is_file():
+        raise UserError(f"{report} is missing; delete {path / 'report'} and run again")
+    overview(results)
+    files = {
+        PurePosixPath("results.json"): (json.dumps(results, indent=1) + "\n").encode(),
+        **{
+            PurePosixPath("figures", file.name): _with_fewer_colours(file)
+            for file in sorted((path / "figures").glob("*.png"))
+        },
+    }
+    text = report.read_text(encoding="utf-8")
+    used = _size(files) + len(text.encode())
+    if used > LIMIT_BYTES:
+        raise UserError(
+            f"the figures and results of {path} have {used:,} bytes; expected at most "
+            f"{LIMIT_BYTES:,}"
+        )
+    styles = results["styles"]
+    for style in styles[:: -(-len(styles) // EPISODES)]:
+        file = path / "figures" / "episodes" / f"{style}.gif"
+        if file.is_file() and used + file.stat().st_size <= LIMIT_BYTES:
+            files[PurePosixPath("figures", "episodes", file.name)] = file.read_bytes()
+            used += file.stat().st_size
+    files[PurePosixPath("report.md")] = without_missing_links(text, files).encode()
+    return results["environment"], files
+
+
+def without_missing_links(text: str, files: Mapping[PurePosixPath, Any]) -> str:
+    """The report without the lines that show a file which is not among the files."""
+    return "".join(
+        line
+        for line in text.splitlines(keepends=True)
+        if all(PurePosixPath(target) in files for target in _LINK.findall(line))
+    )
+
+
+def without_paths(value: Any) -> Any:
+    """The results with absolute paths, which only mean something on one machine, made names."""
+    if isinstance(value, dict):
+        return {key: without_paths(item) for key, item in value.items()}
+    if isinstance(value, list):
+        return [without_paths(item) for item in value]
+    return Path(value).name if isinstance(value, str) and Path(value).is_absolute() else value
+
+
+def read_overviews(out: Path) -> list[Overview]:
+    """The rows of all recorded environments, by name.
+
+    Raises:
+        UserError: nothing is recorded.
+    """
+    files = sorted(out.rglob("results.json"))
+    if not files:
+        raise UserError(f"nothing is recorded in {out}; name the folders of finished runs")
+    return [overview(json.loads(file.read_text(encoding="utf-8"))) for file in files]
+
+
+def _with_fewer_colours(file: Path) -> bytes:
+    """The picture as a PNG with a palette: a third of the size, and no difference to see."""
+    with Image.open(file) as picture:
+        flat = Image.new("RGB", picture.size, "white")
+        with_alpha = picture.convert("RGBA")
+        flat.paste(with_alpha, mask=with_alpha)
+    written = io.BytesIO()
+    flat.quantize(_COLOURS, dither=Image.Dither.NONE).save(written, "PNG", optimize=True)
+    return written.getvalue()
+
+
+def _size(files: Mapping[PurePosixPath, bytes]) -> int:
+    return sum(len(data) for data in files.values())
+
+
+def _stale_pictures(folder: Path, files: Mapping[PurePosixPath, bytes]) -> list[Path]:
+    """Pictures of an earlier record that the new one does not have."""
+    return [
+        file
+        for file in sorted((folder / "figures").rglob("*"))
+        if file.suffix in (".png", ".gif")
+        and PurePosixPath(file.relative_to(folder).as_posix()) not in files
+    ]
+
+
+def _remove(file: Path) -> bool:
+    file.unlink()
+    return True
+
+
+def _write(file: Path, data: bytes) -> bool:
+    """Writes the file if that changes it; says whether it did."""
+    if file.is_file() and file.read_bytes() == data:
+        return False
+    file.parent.mkdir(parents=True, exist_ok=True)
+    file.write_bytes(data)
+    return True
+
+
+def _split_readme(readme: Path) -> tuple[str, str]:
+    """The text before the first marker and after the second."""
+    if not readme.is_file():
+        raise UserError(f"{readme} is missing; name the README with --readme")
+    before, first, rest = readme.read_text(encoding="utf-8").partition(_MARKERS[0])
+    _, second, after = rest.partition(_MARKERS[1])
+    if not first or not second:
+        raise UserError(
+            f"{readme} lacks the markers {_MARKERS[0]} and {_MARKERS[1]}; write them where the "
+            "table of results belongs"
+        )
+    return before, after
+
+
+def _relative(path: Path, start: Path) -> str:
+    """The path as a link in a file in `start`."""
+    return Path(os.path.relpath(path, start)).as_posix()
+
+
+if __name__ == "__main__":
+    main()

@@ -1,0 +1,202 @@
+"""The pages that compare recorded environments, as Markdown."""
+
+from collections.abc import Callable, Sequence
+
+import envs
+from experiments.markdown import table
+from experiments.overview import Overview, number, percent
+from experiments.run_all import ALL
+
+AIM = 0.95
+_Column = tuple[str, Callable[[Overview], str], str]
+
+_ENVIRONMENT: _Column = (
+    "environment",
+    lambda row: f"[{row.environment}]({row.environment}/report.md)",
+    "leads to the run's full report.",
+)
+_SHARE: _Column = (
+    "Haland / Oracle",
+    lambda row: f"**{number(row.share, 3)}**",
+    f"the same divided by each partner's own Oracle: the headline. The aim is {AIM}.",
+)
+_MEASURED: tuple[_Column, ...] = (
+    _ENVIRONMENT,
+    (
+        "Oracle",
+        lambda row: row.amount_with_spread(row.oracle),
+        "return per episode of an ego that was trained for that very held-out partner; mean over "
+        "styles, ± the standard deviation over held-out seeds.",
+    ),
+    (
+        "upper bound",
+        lambda row: row.amount(row.upper_bound),
+        "a return that no pair of players can exceed, worked out from the rules without learning; "
+        "mean over styles.",
+    ),
+    (
+        "Oracle / bound",
+        lambda row: _with_lowest(row.oracle_of_bound, row.lowest_oracle_of_bound),
+        "how good the Oracle itself is: mean over styles, in brackets the lowest style. Shares "
+        "of a weak Oracle say little.",
+    ),
+    (
+        "ceiling",
+        lambda row: number(row.ceiling, 2),
+        "best response / Oracle: the archived egos of the same style with partners that they "
+        "have not met. Haland is generated from them, so it is measured against this too.",
+    ),
+    (
+        "Haland",
+        lambda row: row.amount_with_spread(row.haland),
+        "return with held-out partners from test sentences, which no part has seen; one sample "
+        "each, no trial episodes.",
+    ),
+    _SHARE,
+    (
+        "wrong sentence",
+        lambda row: number(row.wrong_share, 2),
+        "Haland / Oracle from another style's sentence: the control, which must fall.",
+    ),
+    (
+        "translator",
+        lambda row: percent(row.accuracy),
+        "share of the test sentences that are translated into their own style.",
+    ),
+    (
+        "gates met",
+        lambda row: f"{row.gates_met} of {row.gates}",
+        "bars that the stages set themselves before the next one builds on them.",
+    ),
+)
+_WORTH: tuple[_Column, ...] = (
+    _ENVIRONMENT,
+    (
+        "own style",
+        lambda row: row.amount(row.diagonal),
+        "best responses with partners of their style.",
+    ),
+    (
+        "other styles",
+        lambda row: row.amount(row.off_diagonal),
+        "the same egos with partners of the seven other styles.",
+    ),
+    (
+        "universal ego",
+        lambda row: row.amount(row.universal),
+        "one ego trained with the partners of all styles, told nothing.",
+    ),
+    (
+        "universal ego, told",
+        lambda row: row.amount(row.universal_with_label),
+        "the same, told the partner's style in every observation.",
+    ),
+    (
+        "Haland",
+        lambda row: row.amount(row.haland[0] if row.haland else None),
+        "from test sentences.",
+    ),
+)
+_HOW: tuple[_Column, ...] = (
+    _ENVIRONMENT,
+    ("preset", lambda row: f"`{row.preset}`", ""),
+    ("seed", lambda row: str(row.seed), ""),
+    ("held-out partners", lambda row: f"{row.styles} styles × {row.held_out_seeds} seeds", ""),
+    ("minutes", lambda row: number(row.minutes), ""),
+    ("machine", lambda row: row.machine or "–", ""),
+    ("date", lambda row: row.date or "–", ""),
+)
+
+
+def page(overviews: Sequence[Overview], remarks: str) -> str:
+    """The page of all recorded results.
+
+    Args:
+        overviews: a row for each recorded environment, in order.
+        remarks: Markdown by hand, included as it is; empty for none.
+    """
+    sections = [
+        "<!-- Made by python -m experiments.record; remarks by hand belong in remarks.md. -->",
+        f"# Results\n\n{_verdict(overviews)}",
+        _table(overviews, _MEASURED),
+        _meanings(_MEASURED),
+        "## What knowing the style is worth\n\nReturns per episode with held-out partners, mean "
+        "over styles.\n\n" + _table(overviews, _WORTH),
+        _meanings(_WORTH[1:]),
+        "\n".join(f"- **{row.environment}**: {row.worth}" for row in overviews if row.worth),
+        "A wide gap between *own style* and *other styles* means that an ego must know its "
+        "partner's style. Where the *universal ego* comes near *own style*, it can see the style "
+        "for itself, and a sentence has little to add; where being *told* helps it, it cannot.",
+        "## How it was measured\n\n" + _table(overviews, _HOW),
+        "To make the same runs, and this page from them:\n\n```bash\n"
+        + "\n".join(_commands(overviews))
+        + "\n```",
+    ]
+    if remarks.strip():
+        sections.append(f"## Remarks\n\n{remarks.strip()}")
+    return "\n\n".join(filter(None, sections)) + "\n"
+
+
+def short_table(overviews: Sequence[Overview], folder: str) -> str:
+    """The table for the README.
+
+    Args:
+        overviews: a row for each recorded environment, in order.
+        folder: the folder of the recorded results, as a link from the README.
+    """
+    columns = [
+        (
+            "environment",
+            lambda row: f"[{row.environment}]({folder}/{row.environment}/report.md)",
+            "",
+        ),
+        *(column for column in _MEASURED[1:] if column[0] not in ("upper bound", "gates met")),
+    ]
+    presets = sorted({f"`{row.preset}`" for row in overviews})
+    return (
+        f"{_verdict(overviews)} Preset {', '.join(presets)}; [what the columns mean, all "
+        f"environments in detail, and how to make them again]({folder}/README.md).\n\n"
+        + _table(overviews, columns)
+    )
+
+
+def _verdict(overviews: Sequence[Overview]) -> str:
+    """What was found, in a sentence or two, good or bad."""
+    shares = [row.share for row in overviews if row.share is not None]
+    if not shares:
+        return "Haland was not measured from test sentences."
+    reached = sum(share >= AIM for share in shares)
+    earned = f"{min(shares):.1%}"
+    if len(shares) > 1:
+        earned += f" to {max(shares):.1%}"
+    return (
+        f"From sentences never seen, with partners never met, Haland earns {earned} of the Oracle; "
+        f"it reaches the aim of {AIM:.0%} in {reached} of {len(shares)} environments."
+    )
+
+
+def _table(overviews: Sequence[Overview], columns: Sequence[_Column]) -> str:
+    rows = [[show(row) for _, show, _ in columns] for row in overviews]
+    words = ("environment", "preset", "machine", "date")
+    alignment = "".join("l" if name in words else "r" for name, *_ in columns)
+    return table([name for name, *_ in columns], rows, alignment)
+
+
+def _meanings(columns: Sequence[_Column]) -> str:
+    return "\n".join(f"- *{name}*: {meaning}" for name, _, meaning in columns if meaning)
+
+
+def _with_lowest(value: float | None, lowest: float | None) -> str:
+    return "–" if value is None else f"{value:.2f} ({number(lowest, 2)})"
+
+
+def _commands(overviews: Sequence[Overview]) -> list[str]:
+    """The commands that make the runs and record them, one for each preset and seed."""
+    made, recorded = [], []
+    for preset, seed in dict.fromkeys((row.preset, row.seed) for row in overviews):
+        names = [r.environment for r in overviews if (r.preset, r.seed) == (preset, seed)]
+        asked = ALL if set(names) == set(envs.names(styled_only=True)) else ",".join(names)
+        with_seed = f" --seed {seed}" if seed else ""
+        made.append(f"uv run python -m experiments.run --env {asked} --preset {preset}{with_seed}")
+        recorded.append(f"runs/*-{preset}-{seed}")
+    return [*made, f"uv run python -m experiments.record {' '.join(recorded)}"]
