@@ -1,7 +1,9 @@
 """Held-out partners, any sentences.
 
-    python -m experiments.evaluate RUN
-    python -m experiments.evaluate RUN --instructions mine.toml --json out.json
+    python -m experiments.evaluate
+    python -m experiments.evaluate --run FOLDER --instructions mine.toml --json out.json
+
+The model is one that comes with the package, or a run of your own (`--run`).
 
 FILE is TOML, style name = list of sentences:
 
@@ -23,15 +25,20 @@ from rich.table import Table
 
 from experiments import devices
 from experiments.errors import UserError, as_user_error, choose, main_guard
+from experiments.models import DEFAULT_MODEL, instructions_of, open_model
 from experiments.summary import mean, shares
+from haland_jax.pretrained import TrainedModel
+
+LARGEST_BATCH = 64
+"""Pairs that play at once; the compiled program has at most this size."""
 
 
 @dataclasses.dataclass(frozen=True)
 class Arguments:
-    """Measure agents made from sentences with the held-out partners of a finished run."""
+    """Measure agents made from sentences with held-out partners."""
 
-    run: tyro.conf.Positional[Path]
-    """Folder of a finished run."""
+    run: Annotated[str, tyro.conf.arg(metavar="FOLDER|pretrained:ENV")] = DEFAULT_MODEL
+    """Folder of a finished run, or a model that comes with the package."""
     instructions: Annotated[Path | None, tyro.conf.arg(metavar="FILE")] = None
     """TOML file: style name = list of sentences; the packaged test sentences by default."""
     json: Annotated[Path | None, tyro.conf.arg(metavar="OUT")] = None
@@ -70,14 +77,13 @@ def read_sentences(path: Path, style_names: tuple[str, ...]) -> dict[str, list[s
     return content
 
 
-def measure(run: Any, sentences: dict[str, list[str]], games: int, seed: int) -> dict[str, Any]:
+def measure(
+    model: TrainedModel, sentences: dict[str, list[str]], games: int, seed: int
+) -> dict[str, Any]:
     """Plays one policy a sentence with every held-out partner of the sentence's style."""
     from experiments.judge import Judge
-    from experiments.stages import load_archive, load_haland, load_population
 
-    haland, population, archive = load_haland(run), load_population(run), load_archive(run)
-    env = run.env
-    judge = Judge(env, games, run.config.evaluation.batch)
+    haland, env, seeds = model.haland, model.env, model.held_out_seeds
     generate_key, play_key, oracle_key = jax.random.split(jax.random.key(seed), 3)
     rows = [(env.style_names.index(style), s) for style, found in sentences.items() for s in found]
     with as_user_error():
@@ -86,21 +92,17 @@ def measure(run: Any, sentences: dict[str, list[str]], games: int, seed: int) ->
     policies, _ = haland.generate_from_task_language(
         v_hat, jax.random.split(generate_key, len(rows))
     )
-    seeds = run.config.partners.held_out_seeds
     style_rows = np.repeat([style for style, _ in rows], seeds)
     seed_rows = np.tile(np.arange(seeds), len(rows))
+    judge = Judge(env, games, min(LARGEST_BATCH, len(style_rows)))
 
     def play(key: jax.Array, egos: Any) -> np.ndarray:
-        partner = jax.tree.map(
-            lambda leaf: leaf[style_rows, seed_rows], population.held_out_partners
-        )
+        partner = jax.tree.map(lambda leaf: leaf[style_rows, seed_rows], model.held_out_partners)
         styles = jax.tree.map(lambda leaf: leaf[style_rows], env.styles)
         return judge.returns(key, egos, partner, styles).reshape(len(rows), seeds)
 
     returns = play(play_key, jax.tree.map(lambda leaf: jnp.repeat(leaf, seeds, axis=0), policies))
-    oracle = play(
-        oracle_key, jax.tree.map(lambda leaf: leaf[style_rows, seed_rows], archive.oracles)
-    )
+    oracle = play(oracle_key, jax.tree.map(lambda leaf: leaf[style_rows, seed_rows], model.oracles))
     found: dict[str, Any] = {}
     for style in sentences:
         index = env.style_names.index(style)
@@ -122,7 +124,7 @@ def measure(run: Any, sentences: dict[str, list[str]], games: int, seed: int) ->
         }
     measured = [f["share_of_oracle"] for f in found.values() if f["share_of_oracle"] is not None]
     return {
-        "environment": run.config.environment,
+        "environment": env.name,
         "games": games,
         "styles": found,
         "mean": {
@@ -157,18 +159,17 @@ def main() -> None:
     """The command."""
     arguments = tyro.cli(Arguments, prog="python -m experiments.evaluate")
     devices.prepare()
-    from experiments.finished_run import open_run
 
     if arguments.games < 1:
         raise UserError(f"games is {arguments.games}; expected at least 1")
     if arguments.json is not None and not arguments.json.absolute().parent.is_dir():
         raise UserError(f"the folder of {arguments.json} does not exist; make it first")
-    run = open_run(arguments.run)
+    model = open_model(arguments.run)
     if arguments.instructions is not None:
-        sentences = read_sentences(arguments.instructions, run.env.style_names)
+        sentences = read_sentences(arguments.instructions, model.env.style_names)
     else:
-        sentences = {name: list(style.test) for name, style in run.instructions().items()}
-    found = measure(run, sentences, arguments.games, arguments.seed)
+        sentences = {name: list(style.test) for name, style in instructions_of(model).items()}
+    found = measure(model, sentences, arguments.games, arguments.seed)
     Console().print(table_of(found))
     if arguments.json is not None:
         arguments.json.write_text(json.dumps(found, indent=1) + "\n", encoding="utf-8")

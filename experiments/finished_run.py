@@ -1,13 +1,13 @@
 """Opens a run that was made earlier, to generate policies from it."""
 
-import dataclasses
 from pathlib import Path
 from typing import Any
 
 from experiments.configs import PRESETS, RunConfig
 from experiments.errors import UserError, as_user_error
-from experiments.run_folder import RunFolder, to_json
+from experiments.run_folder import RunFolder
 from experiments.stages import POLICY_STAGES, Run
+from haland_jax.configuration import filled
 
 
 def open_run(path: Path) -> Run:
@@ -33,26 +33,9 @@ def _configuration(path: Path, stored: dict[str, Any]) -> RunConfig:
             f"{', '.join(PRESETS)}"
         )
     try:
-        return _filled(template(stored["environment"], stored["seed"]), stored)
+        return filled(template(stored["environment"], stored["seed"]), stored)
     except (KeyError, TypeError, ValueError) as error:
         raise UserError(
             f"config.json of the run in {path} does not fit this version ({error}); make the run "
             "again"
         ) from error
-
-
-def _filled(template: Any, stored: dict[str, Any]) -> Any:
-    """A copy of a dataclass with the stored values; nested dataclasses likewise."""
-    changes = {}
-    for field in dataclasses.fields(template):
-        value, kept = getattr(template, field.name), stored[field.name]
-        if dataclasses.is_dataclass(value):
-            changes[field.name] = _filled(value, kept)
-        elif isinstance(value, tuple):
-            changes[field.name] = tuple(kept)
-        else:
-            changes[field.name] = kept
-    filled = dataclasses.replace(template, **changes)
-    if to_json(filled) != stored:
-        raise ValueError("a setting is unknown")
-    return filled

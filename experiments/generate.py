@@ -1,11 +1,15 @@
 """One sentence, one policy, one episode.
 
-python -m experiments.generate RUN "I stay on the left and never touch the onions"
-python -m experiments.generate RUN "…" --gif episode.gif
+python -m experiments.generate "I stay on the left and never touch the onions" --gif episode.gif
+python -m experiments.generate --run pretrained:overcooked/crossway "…" --gif episode.gif
+python -m experiments.generate --run FOLDER "…"
+
+The model is one that comes with the package, or a run of your own.
 """
 
 import dataclasses
 import time
+from functools import partial
 from pathlib import Path
 from typing import Annotated, Literal
 
@@ -17,16 +21,17 @@ from rich.table import Table
 
 from experiments import devices
 from experiments.errors import UserError, as_user_error, choose, main_guard
+from experiments.models import DEFAULT_MODEL
 
 
 @dataclasses.dataclass(frozen=True)
 class Arguments:
     """Make an agent from one sentence and play an episode with a held-out partner."""
 
-    run: tyro.conf.Positional[Path]
-    """Folder of a finished run."""
     sentence: tyro.conf.Positional[str]
     """How the partner likes to work, in plain words (at most 32 word pieces)."""
+    run: Annotated[str, tyro.conf.arg(metavar="FOLDER|pretrained:ENV")] = DEFAULT_MODEL
+    """Folder of a finished run, or a model that comes with the package."""
     style: Annotated[str | None, tyro.conf.arg(metavar="NAME")] = None
     """Style of the partner to play with; by default the one that the sentence sounds like."""
     gif: Annotated[Path | None, tyro.conf.arg(metavar="FILE")] = None
@@ -42,17 +47,16 @@ def main() -> None:
     """The command."""
     arguments = tyro.cli(Arguments, prog="python -m experiments.generate")
     devices.prepare(cores=1)
-    from experiments.finished_run import open_run
     from experiments.gallery import save_episode
-    from experiments.stages import load_haland, load_population
+    from experiments.models import open_model
     from haland_jax import rollout
 
     if arguments.gif is not None and not arguments.gif.absolute().parent.is_dir():
         raise UserError(f"the folder of {arguments.gif} does not exist; make it first")
-    run = open_run(arguments.run)
+    model = open_model(arguments.run)
+    env, haland = model.env, model.haland
     if arguments.style is not None:
-        choose("style", arguments.style, run.env.style_names)
-    haland, population = load_haland(run), load_population(run)
+        choose("style", arguments.style, env.style_names)
     generate_key, play_key = jax.random.split(jax.random.key(arguments.seed))
     with as_user_error():
         made = haland.explain(arguments.sentence, generate_key, sampler=arguments.sampler)
@@ -61,14 +65,11 @@ def main() -> None:
     made = haland.explain(arguments.sentence, generate_key, sampler=arguments.sampler)
     jax.block_until_ready(made.policy)
     milliseconds = 1000 * (time.perf_counter() - start)
-    sounds_like = run.env.style_names[int(haland.nearest_style(made.v_hat))]
+    sounds_like = env.style_names[int(haland.nearest_style(made.v_hat))]
     style = arguments.style or sounds_like
-    index = run.env.style_names.index(style)
-    partner = jax.tree.map(lambda leaf: leaf[index, 0], population.held_out_partners)
-    play = jax.jit(
-        lambda key: rollout.record(run.env, key, made.policy, partner, run.env.style(style))
-    )
-    game = jax.tree.map(np.asarray, play(play_key))
+    partner = model.partner(style)
+    play = jax.jit(partial(rollout.record, env))
+    game = jax.tree.map(np.asarray, play(play_key, made.policy, partner, env.style(style)))
 
     table = Table(show_header=False, box=None)
     table.add_row("sentence", arguments.sentence)
@@ -77,7 +78,7 @@ def main() -> None:
     table.add_row("partner", f"held-out, style {style}")
     table.add_row("return", f"{game.rewards.sum():.0f} in {game.alive.sum()} steps")
     if arguments.gif is not None:
-        save_episode(run.env, arguments.gif, game, style, arguments.sentence)
+        save_episode(env, arguments.gif, game, style, arguments.sentence)
         table.add_row("episode", str(arguments.gif))
     Console().print(table)
 
