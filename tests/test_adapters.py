@@ -215,6 +215,15 @@ def test_pettingzoo_renders_the_moment(parallel):
     assert np.any(parallel.render() != before)
 
 
+def test_pettingzoo_renders_any_environment_with_a_viewer():
+    pytest.importorskip("pettingzoo")
+    from envs.adapters.pettingzoo import PettingZooEnvironment
+
+    field = PettingZooEnvironment(registry.make("lbf/spread"), render_mode="rgb_array")
+    field.reset(seed=0)
+    assert field.render().shape[1:] == (9 * 64, 3)
+
+
 def test_pettingzoo_refuses_wrong_arguments(environment, parallel):
     from envs.adapters.pettingzoo import PettingZooEnvironment
 
