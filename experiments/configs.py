@@ -13,6 +13,9 @@ from haland_jax.universal import UniversalConfig, universal_config
 
 DEFAULT_ENVIRONMENT = "overcooked/diverse_coordination"
 
+LONGER_TRAINING = {"overcooked/crossway": 1.7}
+"""Factors on the joint training: in the crossway both players must learn to give way."""
+
 
 @dataclasses.dataclass(frozen=True)
 class CompressionConfig:
@@ -95,6 +98,35 @@ class RunConfig:
     evaluation: EvaluationConfig = dataclasses.field(default_factory=EvaluationConfig)
 
 
+def _adapted(config: RunConfig) -> RunConfig:
+    """Fits a preset to the kind of environment: length of games, size of rewards."""
+    joint = config.partners.joint
+    factor = LONGER_TRAINING.get(config.environment, 1.0)
+    joint = dataclasses.replace(joint, total_steps=int(factor * joint.total_steps))
+    config = dataclasses.replace(config, partners=dataclasses.replace(config.partners, joint=joint))
+    if not config.environment.startswith("lbf/"):
+        return config
+
+    def rescaled(training: PPOConfig) -> PPOConfig:
+        # The target pays 1 where a soup pays 20.
+        return dataclasses.replace(training, reward_scale=2.0, confined_until=0.0)
+
+    partners = config.partners
+    return dataclasses.replace(
+        config,
+        max_steps=50,
+        partners=dataclasses.replace(
+            partners,
+            joint=rescaled(partners.joint),
+            refit=rescaled(partners.refit),
+            oracle=rescaled(partners.oracle),
+        ),
+        universal=dataclasses.replace(
+            config.universal, training=rescaled(config.universal.training)
+        ),
+    )
+
+
 def smoke(environment: str, seed: int) -> RunConfig:
     """Every stage at toy size, to see that all of it works; nothing is learnt.
 
@@ -102,7 +134,7 @@ def smoke(environment: str, seed: int) -> RunConfig:
     """
     tiny = PPOConfig(total_steps=1280, num_envs=8, rollout_steps=20, num_minibatches=2, epochs=1)
     refit = dataclasses.replace(tiny, total_steps=640, shaping=0.0, confined_until=0.0)
-    return RunConfig(
+    config = RunConfig(
         environment=environment,
         preset="smoke",
         seed=seed,
@@ -141,6 +173,7 @@ def smoke(environment: str, seed: int) -> RunConfig:
         ),
         evaluation=EvaluationConfig(games=4, samples=1, batch=32),
     )
+    return _adapted(config)
 
 
 def quick(environment: str, seed: int) -> RunConfig:
@@ -148,7 +181,7 @@ def quick(environment: str, seed: int) -> RunConfig:
 
     `python -m experiments.run`; about a quarter of an hour on two CPU cores.
     """
-    return RunConfig(
+    config = RunConfig(
         environment=environment,
         preset="quick",
         seed=seed,
@@ -167,6 +200,7 @@ def quick(environment: str, seed: int) -> RunConfig:
         diffusion=DiffusionConfig(clip=8.0, frequency_jitter=0.08),
         universal=UniversalConfig(training=universal_config(1_500_000)),
     )
+    return _adapted(config)
 
 
 def overnight(environment: str, seed: int) -> RunConfig:
@@ -175,7 +209,7 @@ def overnight(environment: str, seed: int) -> RunConfig:
     `python -m experiments.run --preset overnight --env all`; about three quarters of an hour
     for each environment on two CPU cores.
     """
-    return RunConfig(
+    config = RunConfig(
         environment=environment,
         preset="overnight",
         seed=seed,
@@ -183,9 +217,9 @@ def overnight(environment: str, seed: int) -> RunConfig:
             train_seeds=3,
             held_out_seeds=3,
             spare_seeds=2,
-            joint=PPOConfig(total_steps=1_500_000),
+            joint=PPOConfig(total_steps=1_200_000),
             refit=refit_config(600_000, num_envs=36, partner_noise=0.1),
-            oracle=refit_config(300_000),
+            oracle=refit_config(200_000),
             oracle_candidates=2,
         ),
         compression=CompressionConfig(
@@ -199,6 +233,7 @@ def overnight(environment: str, seed: int) -> RunConfig:
         universal=UniversalConfig(training=universal_config(10_000_000)),
         evaluation=EvaluationConfig(games=32),
     )
+    return _adapted(config)
 
 
 def paper(environment: str, seed: int) -> RunConfig:
@@ -206,7 +241,7 @@ def paper(environment: str, seed: int) -> RunConfig:
 
     `python -m experiments.run --preset paper`; several hours on two CPU cores.
     """
-    return RunConfig(
+    config = RunConfig(
         environment=environment,
         preset="paper",
         seed=seed,
@@ -224,6 +259,7 @@ def paper(environment: str, seed: int) -> RunConfig:
         ),
         evaluation=EvaluationConfig(games=32, samples=4),
     )
+    return _adapted(config)
 
 
 PRESETS: dict[str, Callable[[str, int], RunConfig]] = {

@@ -57,21 +57,21 @@ def train_population(
         start: makes the initial states, leading axis [member].
         styles: style of each member.
         saver: where interrupted training goes on from.
-        report: called with the updates done and the mean reward a step.
+        report: called with the updates done and the mean return.
         stage: for messages.
 
     Returns:
-        The trained states, and the team reward a step of every update, [update, member].
+        The trained states, and the training games' mean return, [update, member].
 
     Raises:
         NonFiniteLoss: training diverged.
     """
     members = jax.tree.leaves(styles)[0].shape[0]
-    rewards = np.zeros((config.num_updates, members), np.float32)
+    returns = np.zeros((config.num_updates, members), np.float32)
     state = start()
-    saved = saver.restore({"state": state, "rewards": rewards})
+    saved = saver.restore({"state": state, "returns": returns})
     if saved is not None:
-        state, rewards = saved["state"], np.array(saved["rewards"])
+        state, returns = saved["state"], np.array(saved["returns"])
     state, styles = partners.place(state), partners.place(styles)
     compiled: dict[int, Callable[..., Any]] = {}
     done = int(np.asarray(state.update)[0])
@@ -82,11 +82,11 @@ def train_population(
         state, metrics = compiled[size](state, styles)
         metrics = {name: np.asarray(values).T for name, values in metrics.items()}
         fit.check_finite(stage, done, metrics)
-        rewards[done : done + size] = metrics["reward"]
+        returns[done : done + size] = metrics["return"]
         done += size
-        report(done, {"return": float(metrics["reward"].mean()) * env.max_steps})
-        saver.save_if_due({"state": state, "rewards": rewards})
-    return state, rewards
+        report(done, {"return": float(metrics["return"].mean())})
+        saver.save_if_due({"state": state, "returns": returns})
+    return state, returns
 
 
 def run_fit(

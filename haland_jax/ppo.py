@@ -125,9 +125,11 @@ def train_chunk(
         style: the partner's style, or `StylesByGame`.
 
     Returns:
-        The new state, and metrics of each update, float32 [num_updates]: `reward`, team
-        reward a step; `shaped`, the mean shaped reward a step; `loss`, the
-        mean loss of those who learn.
+        The new state, and metrics of each update, float32 [num_updates]: `reward`, team reward
+        a step; `return`, team reward a game; `shaped`, the mean shaped reward a step; `loss`,
+        the mean loss of those who learn. Where games end by their own rules, the return is reward / games ended;
+        elsewhere it is what a whole game of such steps would bring, since games that go on
+        from a random moment are shorter.
     """
 
     def one_update(state: TrainState, _: None):
@@ -173,8 +175,11 @@ def _update(
         learner, loss = _learn(config, actor, critic, learner, batch, strided=strided, **rates)
         state = state.replace(**{role: learner})
         losses.append(loss)
+    by_rule = jnp.any(steps["terminated"])
+    game_steps = jnp.where(by_rule, 1 / jnp.mean(steps["ended"]), env.max_steps)
     metrics = {
         "reward": jnp.mean(steps["reward"]),
+        "return": jnp.mean(steps["reward"]) * game_steps,
         "shaped": jnp.mean(steps["shaped"]),
         "loss": jnp.mean(jnp.stack(losses)),
     }
@@ -254,6 +259,7 @@ def _rollout(
             "reward": timesteps.reward,
             "shaped": timesteps.shaped_reward,
             "ended": done,
+            "terminated": timesteps.terminated,
         }
         states = jax.tree.map(restart, fresh, following)
         observations = jax.tree.map(restart, first.observation, timesteps.observation)

@@ -1,5 +1,7 @@
 """Training that is interrupted between two pieces ends as if it had not been."""
 
+import math
+
 import jax
 import numpy as np
 import pytest
@@ -28,7 +30,7 @@ def train(path, *, die_after: int | None = None):
         if done == die_after:
             raise Killed
 
-    state, rewards = training.train_population(
+    state, returns = training.train_population(
         game,
         CONFIG,
         lambda: partners.init_pairs(game, COUNTS, jax.random.key(0)),
@@ -37,12 +39,13 @@ def train(path, *, die_after: int | None = None):
         report,
         "partners",
     )
-    return state, rewards, reported
+    return state, returns, reported
 
 
 def test_a_population_goes_on_where_it_was_and_ends_alike(monkeypatch, tmp_path):
     assert CONFIG.num_updates == 5
-    whole, rewards, reported = train(tmp_path / "whole")
+    monkeypatch.setattr(training, "SECONDS_BETWEEN_CHECKPOINTS", math.inf)
+    whole, returns, reported = train(tmp_path / "whole")
     assert reported == [5]
     assert not (tmp_path / "whole").exists(), "nothing is saved before it is due"
 
@@ -50,9 +53,9 @@ def test_a_population_goes_on_where_it_was_and_ends_alike(monkeypatch, tmp_path)
     monkeypatch.setattr(training, "UPDATES_PER_PIECE", 2)
     with pytest.raises(Killed):
         train(tmp_path / "resumed", die_after=4)
-    resumed, resumed_rewards, reported = train(tmp_path / "resumed")
+    resumed, resumed_returns, reported = train(tmp_path / "resumed")
     assert reported == [4, 5], "the piece after the last checkpoint is done again, no other"
-    np.testing.assert_allclose(resumed_rewards, rewards, rtol=1e-6)
+    np.testing.assert_allclose(resumed_returns, returns, rtol=1e-6)
     for one, two in zip(
         jax.tree.leaves((whole.ego, whole.partner)),
         jax.tree.leaves((resumed.ego, resumed.partner)),

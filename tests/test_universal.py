@@ -117,7 +117,7 @@ def test_a_style_for_all_games_and_the_same_style_by_game_play_alike():
     for style in (game.style("long"), StylesByGame(twice)):
         state = ppo.init_train_state(game, TINY, jax.random.key(1), ego, frozen, style)
         _, metrics = jax.jit(partial(ppo.train_chunk, game, TINY, 1))(state, style)
-        found.append(float(metrics["reward"][0]))
+        found.append(float(metrics["return"][0]))
     assert found[0] == pytest.approx(found[1], rel=1e-6)
 
 
@@ -236,9 +236,9 @@ class Killed(BaseException):
 def test_interrupted_training_ends_alike(monkeypatch, tmp_path):
     env = Labelled(ToyGame())
     config = dataclasses.replace(
-        CONFIG, training=dataclasses.replace(TINY, total_steps=200), seeds=1
+        CONFIG, training=dataclasses.replace(TINY, total_steps=160), seeds=1
     )
-    assert config.training.num_updates == 5
+    assert config.training.num_updates == 4
     frozen = frozen_partners([[0], [1]])
 
     def run(path, die_after=None):
@@ -256,14 +256,15 @@ def test_interrupted_training_ends_alike(monkeypatch, tmp_path):
             "universal egos",
         )
 
-    whole, rewards = run(tmp_path / "whole")
-    monkeypatch.setattr(training, "SECONDS_BETWEEN_CHECKPOINTS", 0.0)
     monkeypatch.setattr(training, "UPDATES_PER_PIECE", 2)
+    whole, returns = run(tmp_path / "whole")
+    assert not (tmp_path / "whole").exists(), "nothing is saved before it is due"
+    monkeypatch.setattr(training, "SECONDS_BETWEEN_CHECKPOINTS", 0.0)
     with pytest.raises(Killed):
         run(tmp_path / "resumed", die_after=4)
     assert (tmp_path / "resumed").exists()
-    resumed, resumed_rewards = run(tmp_path / "resumed")
-    np.testing.assert_allclose(resumed_rewards, rewards, rtol=1e-6)
+    resumed, resumed_returns = run(tmp_path / "resumed")
+    np.testing.assert_allclose(resumed_returns, returns, rtol=1e-6)
     for one, two in zip(jax.tree.leaves(whole.ego), jax.tree.leaves(resumed.ego), strict=True):
         np.testing.assert_allclose(one, two, rtol=1e-5, atol=1e-6)
     assert isinstance(env.styles, LabelledStyle)

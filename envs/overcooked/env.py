@@ -203,6 +203,7 @@ class Overcooked:
             pays=style.pays,
             hand_over=style.hand_over,
             welcome=style.welcome,
+            way=style.way,
             weights=self.weights,
         )
         return sum(terms.values(), start=jnp.zeros(2))

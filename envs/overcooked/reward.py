@@ -11,7 +11,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
-from envs.overcooked import dynamics
+from envs.overcooked import dynamics, paths
 from envs.overcooked.dynamics import Interaction, State, Transition
 from envs.overcooked.layouts import Layout
 
@@ -29,17 +29,19 @@ class ShapingWeights:
     `potting`, `dish` and `soup_taken` are the reference's, but a soup that nobody ordered
     earns less when it is taken from the pot. Starting an unfinished pot costs nothing: any
     fine keeps random players, who start the pot by accident all the time, from learning to
-    use it at all (measured: docs/paper_map.md).
+    use it at all (measured: docs/paper_map.md). `way` pays both players for each step by which
+    a carrier's way gets shorter, so that giving way is paid at once.
     """
 
     potting: float = 3.0
     dish: float = 3.0
     soup_taken: float = 5.0
     unordered_soup_taken: float = 2.0
-    start_full: float = 1.0
+    start_full: float = 3.0
     spoilt: float = -1.0
     unpaid_delivery: float = -1.0
     hand_over: float = 1.0
+    way: float = 0.3
 
 
 def order_values(orders: tuple[int, ...], soup_reward: float = 20.0) -> np.ndarray:
@@ -125,6 +127,7 @@ def guided_shaping_terms(
     pays: jax.Array,
     hand_over: jax.Array,
     welcome: jax.Array,
+    way: jax.Array,
     weights: ShapingWeights,
 ) -> dict[str, jax.Array]:
     """Returns our shaped reward by named term, each float32 [agent].
@@ -138,6 +141,7 @@ def guided_shaping_terms(
             is won by putting a thing down and taking it back, whoever does it.
         welcome: how many items of each kind are welcome on the shared counters at once,
             float32 [4]; further ones are in the way.
+        way: steps to the stations around the other, int32 [agent, F, F, K].
         weights: the terms' weights.
     """
     did = transition.interactions
@@ -174,4 +178,30 @@ def guided_shaping_terms(
         "unordered_soup_taken": weights.unordered_soup_taken * (taken & ~complete),
         "unpaid_delivery": weights.unpaid_delivery * unpaid,
         "hand_over": weights.hand_over * value * (put.astype(jnp.float32) - picked),
+        "way": weights.way
+        * jnp.full(
+            2,
+            clear_way(layout, transition.after, pays, way)
+            - clear_way(layout, transition.before, pays, way),
+        ),
     }
+
+
+def clear_way(layout: Layout, state: State, pays: jax.Array, way: jax.Array) -> jax.Array:
+    """Returns how near carriers are to where their load is wanted, float32 [], >= 0.
+
+    A dish is wanted at a pot that cooks or is ready, a soup where it pays; a carrier whom the
+    other blocks counts as far away. Summed over both players, so that its change in a step is
+    a potential-based reward (Ng et al., 1999) for walking there and for giving way alike.
+    """
+    kinds = np.array(list(layout.station_kinds))
+    pots, serving = np.flatnonzero(kinds == "P"), np.flatnonzero(kinds == "S")
+    agents = np.arange(2)
+    steps = way[agents, state.cell[::-1], state.cell]
+    wants_dish = state.pot_timer >= 0
+    content = jnp.maximum(state.held - dynamics.SOUP, 0)
+    wants_soup = pays[serving][:, content].T > 0
+    holds_dish = state.held == dynamics.DISH
+    wanted = jnp.concatenate([holds_dish[:, None] & wants_dish, wants_soup], axis=1)
+    nearest = jnp.min(jnp.where(wanted, steps[:, np.r_[pots, serving]], paths.REACH), axis=1)
+    return jnp.sum(paths.REACH - nearest).astype(jnp.float32)

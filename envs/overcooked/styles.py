@@ -13,7 +13,7 @@ import jax.numpy as jnp
 import numpy as np
 from flax.struct import PyTreeNode
 
-from envs.overcooked import dynamics, events, reward
+from envs.overcooked import dynamics, events, paths, reward
 from envs.overcooked.dynamics import State
 from envs.overcooked.layouts import Layout
 
@@ -21,6 +21,8 @@ FREE_STYLE = "free"
 """The only style of the classic kitchens: nothing is forbidden."""
 
 POOL_SIZE = 256
+FULL_POTS = 0.4
+"""Share of the pots that are full for certain in the moments to start from."""
 ITEM_KINDS = events.ITEM_KINDS
 
 
@@ -40,6 +42,8 @@ class Style(PyTreeNode):
             [agent, C, 4]; training only.
         welcome: how many items of each kind are welcome on the shared counters at once,
             float32 [4]; training only.
+        way: steps of each player to each station around the other (`paths.steps_around`),
+            int32 [agent, other's cell, own cell, K]; training only.
         pool: moments of games to start from in training, `State` with leading axis [pool];
             the first is the usual start.
     """
@@ -53,6 +57,7 @@ class Style(PyTreeNode):
     task: jax.Array
     hand_over: jax.Array
     welcome: jax.Array
+    way: jax.Array
     pool: State
 
 
@@ -237,6 +242,12 @@ def build_style(layout: Layout, rule: Rule, *, max_steps: int) -> Style:
         "task": task,
         "hand_over": hand_over,
         "welcome": _welcome_items(rule),
+        "way": np.stack(
+            [
+                paths.steps_around(layout, np.ones_like(partner_cells), np.ones_like(role_targets)),
+                paths.steps_around(layout, partner_cells, partner_targets),
+            ]
+        ).astype(np.int32),
         "pool": pool,
     }
     return jax.tree.map(jnp.asarray, Style(**arrays))
@@ -366,9 +377,12 @@ def _random_moment(
         offered = random.choice(needed, layout.num_counters)
         counters = np.where(shared & (random.random(len(shared)) < 0.5), offered, counters)
     amounts = random.integers(0, 4, layout.num_pots)
+    amounts = np.where(random.random(layout.num_pots) < FULL_POTS, 3, amounts)
     units = random.choice([4, 1][: len(ingredients)], layout.num_pots)
     cooking = (amounts == 3) & (random.random(layout.num_pots) < 0.7)
-    timer = random.integers(0, layout.cook_time + 1, layout.num_pots)
+    # Twice the cook time: half of the soups that were started are ready.
+    timer = random.integers(0, 2 * layout.cook_time + 1, layout.num_pots)
+    timer = np.minimum(timer, layout.cook_time)
     arrays: dict[str, Any] = {
         "cell": np.array([ego, partner], np.int32),
         "orientation": random.integers(0, 4, 2).astype(np.int32),

@@ -38,7 +38,7 @@ def make_partners(run: Run, task: StageProgress) -> dict[str, Any]:
     """Stage 1a: trains pairs of every style and seed together and keeps the best."""
     config, env = run.config.partners, run.env
     train_key, play_key = jax.random.split(run.key("partners"))
-    state, rewards = train_population(
+    state, curve = train_population(
         env,
         config.joint,
         lambda: partners.init_pairs(env, config, train_key),
@@ -50,9 +50,9 @@ def make_partners(run: Run, task: StageProgress) -> dict[str, Any]:
     returns = _mean_returns(run, play_key, state.ego.actor, state.partner.actor, config.num_seeds)
     population = partners.make_population(env, config, state, returns)
     checkpoint.save(run.path("partners", "population"), population)
-    points = np.linspace(0, len(rewards), min(CURVE_POINTS, len(rewards)) + 1).astype(int)
-    smooth = [rewards[a:b].mean(0) for a, b in itertools.pairwise(points)]
-    by_style = np.array(smooth).reshape(len(smooth), len(env.style_names), -1) * env.max_steps
+    points = np.linspace(0, len(curve), min(CURVE_POINTS, len(curve)) + 1).astype(int)
+    smooth = [curve[a:b].mean(0) for a, b in itertools.pairwise(points)]
+    by_style = np.array(smooth).reshape(len(smooth), len(env.style_names), -1)
     return {
         "joint_returns": dict(zip(env.style_names, returns.tolist(), strict=True)),
         "kept_for_training": np.asarray(population.train_index),

@@ -22,7 +22,7 @@ def train_universal(run: Run, task: StageProgress) -> dict[str, Any]:
     config, env = run.config.universal, Labelled(run.env)
     partners = load_population(run).train_partners
     key = run.key("universal")
-    state, rewards = train_population(
+    state, returns = train_population(
         env,
         config.training,
         lambda: universal.init_universal(env, config, key, partners),
@@ -32,9 +32,8 @@ def train_universal(run: Run, task: StageProgress) -> dict[str, Any]:
         "universal egos",
     )
     checkpoint.save(run.path("universal", "egos"), state.ego.actor)
-    points = np.linspace(0, len(rewards), min(CURVE_POINTS, len(rewards)) + 1).astype(int)
-    smooth = np.array([rewards[a:b].mean(axis=0) for a, b in itertools.pairwise(points)])
-    smooth *= env.max_steps
+    points = np.linspace(0, len(returns), min(CURVE_POINTS, len(returns)) + 1).astype(int)
+    smooth = np.array([returns[a:b].mean(axis=0) for a, b in itertools.pairwise(points)])
     curves = smooth.reshape(len(smooth), len(universal.VARIANTS), -1)  # [point, variant, seed]
     return {
         "steps": config.training.num_updates * config.training.steps_per_update,
