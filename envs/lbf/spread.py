@@ -23,7 +23,7 @@ TAKEN_SHARE = 0.3
 
 _CENTRE = np.array([(row, column) for row in (3, 4, 5) for column in (3, 4, 5)], np.int32)
 _FREE = np.array(
-    [cell for cell in np.ndindex(SIZE, SIZE) if not (cell == PLACES).all(axis=1).any()], np.int32
+    [cell for cell in np.ndindex(SIZE, SIZE) if list(cell) not in PLACES.tolist()], np.int32
 )
 
 
