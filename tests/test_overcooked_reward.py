@@ -1,5 +1,7 @@
 """Deliveries and shaped rewards, each term in a transition in which it fires."""
 
+import dataclasses
+
 import jax
 import numpy as np
 import pytest
@@ -18,6 +20,7 @@ WEIGHTS = ShapingWeights(
     spoilt=-1.0,
     unpaid_delivery=-1.0,
     hand_over=2.0,
+    way=0.0,
 )
 
 
@@ -38,14 +41,15 @@ def kitchen(rooms):
     return DrawnKitchen(rooms.layout, rooms.style("left_no_onion"))
 
 
-def guided(env, style, transition):
+def guided(env, style, transition, weights=WEIGHTS):
     return reward.guided_shaping_terms(
         env.layout,
         transition,
         pays=style.pays,
         hand_over=style.hand_over,
         welcome=style.welcome,
-        weights=WEIGHTS,
+        way=style.way,
+        weights=weights,
     )
 
 
@@ -185,8 +189,64 @@ def test_every_guided_term_was_seen_in_these_tests(rooms, kitchen):
     found = guided(rooms, rooms.style("left_no_onion"), kitchen.play())
     assert set(found) == {
         *("potting", "spoilt", "dish", "start_full", "soup_taken"),
-        *("unordered_soup_taken", "unpaid_delivery", "hand_over"),
+        *("unordered_soup_taken", "unpaid_delivery", "hand_over", "way"),
     }
+
+
+@pytest.fixture(scope="module")
+def crossway():
+    return envs.make("overcooked/crossway")
+
+
+def way_term(crossway, kitchen, *actions) -> list[float]:
+    style = crossway.style("upper_no_dish")
+    weights = dataclasses.replace(WEIGHTS, way=0.5)
+    return np.asarray(guided(crossway, style, kitchen.play(*actions), weights)["way"]).tolist()
+
+
+def in_the_upper_arm(crossway) -> DrawnKitchen:
+    """The ego at the centre with a dish; the partner at the arm's end, where a soup cooks."""
+    kitchen = DrawnKitchen(crossway.layout, crossway.style("upper_no_dish"))
+    kitchen.fill(2, 1, "ooo", timer=3)
+    kitchen.place(0, 3, 3, held="dish")
+    kitchen.place(1, 3, 1)
+    return kitchen
+
+
+def test_walking_to_a_cooking_pot_with_a_dish_pays_both_for_each_step(crossway):
+    kitchen = in_the_upper_arm(crossway)
+    kitchen.place(1, 4, 3)
+    # From the centre it is two steps to the pot; each is worth one half.
+    assert way_term(crossway, kitchen, "north", "stay") == [0.5, 0.5]
+    assert way_term(crossway, kitchen, "south", "stay") == [-0.5, -0.5]
+
+
+def test_leaving_the_arm_clears_the_way_and_entering_it_blocks_it(crossway):
+    kitchen = in_the_upper_arm(crossway)
+    kitchen.place(0, 3, 4, held="dish")
+    kitchen.place(1, 3, 3)
+    # The partner at the centre blocks the way (12 steps); beside it, three steps are left.
+    assert way_term(crossway, kitchen, "stay", "west") == [4.5, 4.5]
+    kitchen.place(1, 2, 3)
+    assert way_term(crossway, kitchen, "stay", "east") == [-4.5, -4.5]
+
+
+def test_the_way_pays_nothing_without_a_load_or_a_place_for_it(crossway):
+    kitchen = in_the_upper_arm(crossway)
+    kitchen.place(1, 4, 3)
+    kitchen.place(0, 3, 3)
+    assert way_term(crossway, kitchen, "north", "stay") == [0, 0]
+    kitchen.place(0, 3, 3, held="dish")
+    kitchen.fill(2, 1, "ooo")
+    assert way_term(crossway, kitchen, "north", "stay") == [0, 0], "nobody started the pot"
+
+
+def test_a_soup_is_carried_to_where_it_pays(crossway):
+    kitchen = in_the_upper_arm(crossway)
+    kitchen.place(0, 3, 3, held="ooo")
+    assert way_term(crossway, kitchen, "west", "stay") == [0.5, 0.5]
+    kitchen.place(0, 3, 3, held="oo")
+    assert way_term(crossway, kitchen, "west", "stay") == [0, 0], "nobody ordered it"
 
 
 def test_reference_shaping_pays_any_potting_dish_and_soup(orders):
