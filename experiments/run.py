@@ -77,7 +77,7 @@ def run_one(environment: str, preset: str, seed: int, out: Path | None) -> None:
     console.print(summary_table(results))
     console.print(f"Report: {path / 'report.md'}", highlight=False)
     console.print(
-        f'Next: python -m experiments.generate "I stay on the left …" --run {path} --gif episode.gif',
+        f'Next: python -m experiments.generate "I stay left …" --run {path} --gif episode.gif',
         highlight=False,
     )
 
