@@ -13,8 +13,9 @@ from haland_jax.universal import UniversalConfig, universal_config
 
 DEFAULT_ENVIRONMENT = "overcooked/diverse_coordination"
 
-LONGER_TRAINING = {"overcooked/crossway": 1.7}
-"""Factors on the joint training: in the crossway both players must learn to give way."""
+TRAINING_LENGTH = {"overcooked/crossway": 1.7, "lbf/spread": 0.4}
+"""Factors on the joint training: in the crossway both players must learn to give way; Spread is
+learnt within 200,000 steps."""
 
 
 @dataclasses.dataclass(frozen=True)
@@ -101,7 +102,7 @@ class RunConfig:
 def _adapted(config: RunConfig) -> RunConfig:
     """Fits a preset to the kind of environment: length of games, size of rewards."""
     joint = config.partners.joint
-    factor = LONGER_TRAINING.get(config.environment, 1.0)
+    factor = TRAINING_LENGTH.get(config.environment, 1.0)
     joint = dataclasses.replace(joint, total_steps=int(factor * joint.total_steps))
     config = dataclasses.replace(config, partners=dataclasses.replace(config.partners, joint=joint))
     if not config.environment.startswith("lbf/"):
