@@ -66,6 +66,10 @@ class Environment(Protocol):
         """Returns one style. Raises ValueError for an unknown name."""
         ...
 
+    def upper_bounds(self) -> dict[str, float]:
+        """Returns a return for each style that no two players can exceed."""
+        ...
+
     def reset(self, key: jax.Array, style: Any) -> tuple[Any, TimeStep]:
         """Starts a game; consumes `key`."""
         ...

@@ -57,6 +57,10 @@ class Labelled:
         """Returns the style with the ego held to its role (training only)."""
         return style.replace(style=self.env.confine(style.style))
 
+    def upper_bounds(self) -> dict[str, float]:
+        """Returns the environment's own bounds."""
+        return self.env.upper_bounds()
+
     def reset(self, key: jax.Array, style: LabelledStyle) -> tuple[Any, TimeStep]:
         """Starts a game; consumes `key`."""
         state, timestep = self.env.reset(key, style.style)

@@ -77,6 +77,7 @@ def evaluate(run: Run, task: StageProgress) -> dict[str, Any]:
     results[WRONG_SENTENCE] = wrong_sentences(judge, next(keys), egos[TEST_SENTENCES], held_out)
     cross = cross_play(judge, next(keys), archive.egos.actor, held_out)
     right = nearest_is_right(haland, translated[TEST_SENTENCES])
+    upper_bounds = env.upper_bounds()
     gate = policy_vae_gate(run, judge, next(keys))
     for method, policies in zip(COMPARISONS, load_universal(run).values(), strict=True):
         results[method] = judge.with_held_out(next(keys), policies, held_out).mean(axis=2)
@@ -87,7 +88,8 @@ def evaluate(run: Run, task: StageProgress) -> dict[str, Any]:
             for method, by_style in results.items()
         },
         "oracle": {name: results[ORACLE][i] for i, name in enumerate(env.style_names)},
-        "gates": gates(results, gate),
+        "gates": gates(results, gate, list(upper_bounds.values())),
+        "upper_bounds": upper_bounds,
         "policy_vae": gate,
         "translator": {
             "accuracy": float(right.mean()),

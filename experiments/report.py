@@ -186,6 +186,7 @@ def _gates(results: Mapping[str, Any]) -> str:
 def _by_style(results: Mapping[str, Any]) -> str:
     methods = [name for name in ordered_methods(results) if name in (*METHODS, *COMPARISONS)]
     tables = {name: (returns(results, name), ratios(results, name)) for name in methods}
+    bounds = results.get("upper_bounds")
     rows = []
     for index, style in enumerate(results["styles"]):
         cells = []
@@ -193,9 +194,15 @@ def _by_style(results: Mapping[str, Any]) -> str:
             share = mean(shares[index])
             of_oracle = "" if method == ORACLE or np.isnan(share) else f" ({share:.2f})"
             cells.append(_with_spread(values[index].mean(), spread(values[index])) + of_oracle)
+        if bounds:
+            of_bound = tables[ORACLE][0][index].mean() / bounds[style]
+            cells += [f"{bounds[style]:g}", f"{of_bound:.2f}"]
         rows.append((style.replace("_", " "), *cells))
-    table = _table(("style", *methods), rows, "l" + "r" * len(methods))
+    head = ("style", *methods, *(("upper bound", "Oracle / bound") if bounds else ()))
+    table = _table(head, rows, "l" + "r" * (len(head) - 1))
     note = "Return ± deviation over seeds; in brackets the share of the Oracle."
+    if bounds:
+        note += " No two players, whatever they know, can exceed the upper bound."
     return f"## By style\n\n{table}\n\n{note}"
 
 

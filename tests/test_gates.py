@@ -5,6 +5,7 @@ import pytest
 
 from experiments import gates, summary
 
+BOUNDS = (200.0, 100.0)
 VAE = {"decoded_share": np.array([[0.97, 1.01]]), "perturbed_share": np.array([[0.94, 1.0]])}
 
 
@@ -28,12 +29,15 @@ def test_shares_leave_out_partners_whose_oracle_earns_nothing():
 
 def test_gates_hold_the_mean_share_and_the_lowest_style():
     best, haland = ((90.0, 150.0), (50.0, 0.0)), ((80.0, 200.0), (50.0, 0.0))
-    found = gates.gates(results(best, haland, ((60.0, 120.0), (30.0, 0.0))), VAE)
+    found = gates.gates(results(best, haland, ((60.0, 120.0), (30.0, 0.0))), VAE, BOUNDS)
     # (0.9 + 0.75 + 1.0) / 3; the style with the lowest share earns 240 / 300 of its Oracles.
     assert found["best responses / Oracle, mean"]["value"] == pytest.approx(2.65 / 3)
     assert not found["best responses / Oracle, mean"]["met"]
     assert found["best responses / Oracle, lowest style"]["value"] == pytest.approx(0.8)
     assert found["best responses / Oracle, lowest style"]["met"]
+    # The Oracles earn 150 of 200 and 25 of 100.
+    assert found["Oracle / upper bound, lowest style"]["value"] == pytest.approx(0.25)
+    assert not found["Oracle / upper bound, lowest style"]["met"]
     assert found["decoded / original policy, lowest"]["met"]
     assert not found["decoded / original policy, z perturbed, lowest"]["met"]
     assert found["Haland from test sentences / Oracle"]["value"] == pytest.approx(2.8 / 3)
@@ -44,6 +48,6 @@ def test_gates_hold_the_mean_share_and_the_lowest_style():
 
 def test_without_any_oracle_no_share_is_met_and_all_values_are_finite():
     nothing = np.zeros((2, 2))
-    found = gates.gates(results(nothing, nothing, nothing, oracle=nothing), VAE)
+    found = gates.gates(results(nothing, nothing, nothing, oracle=nothing), VAE, BOUNDS)
     assert found["Haland from test sentences / Oracle"] == {"value": 0.0, "bar": 0.9, "met": False}
     assert all(np.isfinite(gate["value"]) for gate in found.values())

@@ -82,6 +82,10 @@ class Spread:
         index = self.style_names.index(name)
         return jax.tree.map(lambda leaf: leaf[index], self.styles)
 
+    def upper_bounds(self) -> dict[str, float]:
+        """Returns 1 for each style: the target pays once and ends the game."""
+        return dict.fromkeys(self.style_names, 1.0)
+
     @staticmethod
     def confine(style: Style) -> Style:
         """Returns the style as it is: the ego of Spread has no role to be held to."""

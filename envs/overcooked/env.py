@@ -80,6 +80,19 @@ class Overcooked:
         index = self.style_names.index(name)
         return jax.tree.map(lambda leaf: leaf[index], self.styles)
 
+    def upper_bounds(self) -> dict[str, float]:
+        """Returns a return for each style that no two players can exceed; takes seconds."""
+        # Only who asks for bounds waits for the solver's import.
+        from envs.overcooked.bounds import upper_bound
+
+        old = self.dynamics == "old"
+        return {
+            name: upper_bound(
+                self.layout, self.style(name), max_steps=self.max_steps, old_dynamics=old
+            )
+            for name in self.style_names
+        }
+
     @staticmethod
     def confine(style: Style) -> Style:
         """Returns the style with the ego held to its role (training only)."""
