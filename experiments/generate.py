@@ -9,6 +9,8 @@ The model is one that comes with the package, or a run of your own.
 
 import dataclasses
 import time
+from collections.abc import Callable
+from concurrent.futures import ThreadPoolExecutor
 from functools import partial
 from pathlib import Path
 from typing import Annotated, Literal
@@ -21,7 +23,10 @@ from rich.table import Table
 
 from experiments import devices
 from experiments.errors import UserError, as_user_error, choose, main_guard
-from experiments.models import DEFAULT_MODEL
+from experiments.models import DEFAULT_MODEL, open_model
+from haland_jax import rollout
+from haland_jax.pretrained import TrainedModel
+from haland_jax.rollout import Recording
 
 
 @dataclasses.dataclass(frozen=True)
@@ -42,14 +47,20 @@ class Arguments:
     """ddim is fast; ddpm takes all steps of Eq. 1."""
 
 
+def _compile_game(model: TrainedModel, key: jax.Array) -> Callable[..., Recording]:
+    """One game of key, ego, partner and style, compiled; any policies of the model's will do."""
+    env, style = model.env, model.env.style_names[0]
+    ego = jax.tree.map(lambda leaf: leaf[0, 0], model.oracles)
+    game = jax.jit(partial(rollout.record, env))
+    return game.lower(key, ego, model.partner(style), env.style(style)).compile()
+
+
 @main_guard
 def main() -> None:
     """The command."""
     arguments = tyro.cli(Arguments, prog="python -m experiments.generate")
     devices.prepare(cores=1)
     from experiments.gallery import save_episode
-    from experiments.models import open_model
-    from haland_jax import rollout
 
     if arguments.gif is not None and not arguments.gif.absolute().parent.is_dir():
         raise UserError(f"the folder of {arguments.gif} does not exist; make it first")
@@ -58,9 +69,12 @@ def main() -> None:
     if arguments.style is not None:
         choose("style", arguments.style, env.style_names)
     generate_key, play_key = jax.random.split(jax.random.key(arguments.seed))
-    with as_user_error():
+    # The compiler leaves a core idle: the game is compiled beside the generation.
+    with ThreadPoolExecutor(1) as beside, as_user_error():
+        compiling = beside.submit(_compile_game, model, play_key)
         made = haland.explain(arguments.sentence, generate_key, sampler=arguments.sampler)
-    jax.block_until_ready(made.policy)
+        jax.block_until_ready(made.policy)
+    play = compiling.result()
     start = time.perf_counter()
     made = haland.explain(arguments.sentence, generate_key, sampler=arguments.sampler)
     jax.block_until_ready(made.policy)
@@ -68,7 +82,6 @@ def main() -> None:
     sounds_like = env.style_names[int(haland.nearest_style(made.v_hat))]
     style = arguments.style or sounds_like
     partner = model.partner(style)
-    play = jax.jit(partial(rollout.record, env))
     game = jax.tree.map(np.asarray, play(play_key, made.policy, partner, env.style(style)))
 
     table = Table(show_header=False, box=None)

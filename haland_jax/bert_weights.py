@@ -16,7 +16,6 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 from flax import struct, traverse_util
-from huggingface_hub import snapshot_download
 from safetensors import SafetensorError, safe_open
 from transformers import AutoTokenizer, BertConfig, PreTrainedTokenizerBase
 
@@ -69,6 +68,9 @@ def checkpoint_folder(source: str | None = None) -> Path:
         raise EncoderWeightsError(
             f"encoder {source!r} is neither a folder nor a model name such as 'bert-base-uncased'"
         )
+    # The import takes a second, which the packaged encoder can save.
+    from huggingface_hub import snapshot_download
+
     patterns = [CONFIG_FILE, WEIGHTS_FILE, "tokenizer*", "vocab.txt", "special_tokens_map.json"]
     try:
         return Path(snapshot_download(source, allow_patterns=patterns))

@@ -15,13 +15,12 @@ import hashlib
 import json
 import os
 import shutil
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
 import jax
 import numpy as np
-import orbax.checkpoint
 
 _ARRAYS, _METADATA, _MANIFEST = "arrays", "metadata.json", "manifest.json"
 _REMEDY = "delete that folder and run the same command again to make it anew"
@@ -64,8 +63,7 @@ def save(path: str | Path, tree: Any, metadata: Mapping[str, Any] | None = None)
     shutil.rmtree(writing, ignore_errors=True)
     writing.mkdir()
     if arrays:
-        with _checkpointer() as checkpointer:
-            checkpointer.save(writing / _ARRAYS, arrays)
+        _write_arrays(writing / _ARRAYS, arrays)
     described = {"metadata": dict(metadata or {}), "leaves": leaves}
     _write_text(writing / _METADATA, json.dumps(described, indent=1, allow_nan=False))
     _write_text(writing / _MANIFEST, _manifest_text(_digests(writing)))
@@ -101,9 +99,7 @@ def restore(path: str | Path, like: Any = None) -> Any:
     values = {name: _scalar(leaf) for name, leaf in leaves.items()}
     stored = [name for name, leaf in leaves.items() if leaf["kind"] in ("array", "key")]
     if stored:
-        as_numpy = {name: orbax.checkpoint.RestoreArgs(restore_type=np.ndarray) for name in stored}
-        with _checkpointer() as checkpointer:
-            arrays = checkpointer.restore(folder / _ARRAYS, restore_args=as_numpy)
+        arrays = _read_arrays(folder / _ARRAYS, stored)
         for name in stored:
             values[name] = np.asarray(arrays[name])
             if leaves[name]["kind"] == "key":
@@ -288,8 +284,22 @@ def _digests(folder: Path) -> dict[str, dict]:
     return digests
 
 
-def _checkpointer() -> orbax.checkpoint.Checkpointer:
-    return orbax.checkpoint.Checkpointer(orbax.checkpoint.PyTreeCheckpointHandler())
+# Orbax takes a second to import, which a command without checkpoints can save.
+
+
+def _write_arrays(path: Path, arrays: Mapping[str, np.ndarray]) -> None:
+    from orbax.checkpoint import Checkpointer, PyTreeCheckpointHandler
+
+    with Checkpointer(PyTreeCheckpointHandler()) as checkpointer:
+        checkpointer.save(path, arrays)
+
+
+def _read_arrays(path: Path, names: Sequence[str]) -> Mapping[str, np.ndarray]:
+    from orbax.checkpoint import Checkpointer, PyTreeCheckpointHandler, RestoreArgs
+
+    as_numpy = {name: RestoreArgs(restore_type=np.ndarray) for name in names}
+    with Checkpointer(PyTreeCheckpointHandler()) as checkpointer:
+        return checkpointer.restore(path, restore_args=as_numpy)
 
 
 def _absolute(path: str | Path) -> Path:

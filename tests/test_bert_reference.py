@@ -288,6 +288,6 @@ def test_a_name_that_the_hub_does_not_give_is_refused(monkeypatch):
     def offline(*_, **__):
         raise ConnectionError("no network")
 
-    monkeypatch.setattr("haland_jax.bert_weights.snapshot_download", offline)
+    monkeypatch.setattr("huggingface_hub.snapshot_download", offline)
     with pytest.raises(EncoderWeightsError, match=r"could not be fetched .* give a local folder"):
         load_encoder("bert-base-uncased")

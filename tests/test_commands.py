@@ -69,13 +69,13 @@ def test_run_refuses_a_folder_of_something_else(capsys, monkeypatch, tmp_path):
 @pytest.mark.parametrize("command", [evaluate, generate])
 def test_a_missing_or_unfinished_run_is_named(capsys, monkeypatch, tmp_path, command):
     sentence = ("I stay left",) if command is generate else ()
-    line = refused(capsys, monkeypatch, command, tmp_path / "nowhere", *sentence)
+    line = refused(capsys, monkeypatch, command, "--run", tmp_path / "nowhere", *sentence)
     assert "nowhere is missing; make a run with python -m experiments.run" in line
     assert not (tmp_path / "nowhere").exists()
     with RunFolder.write(tmp_path / "begun", configs.smoke(configs.DEFAULT_ENVIRONMENT, 0)) as run_:
         for stage in STAGES[:3]:
             run_.finish_stage(stage, {})
-    line = refused(capsys, monkeypatch, command, tmp_path / "begun", *sentence)
+    line = refused(capsys, monkeypatch, command, "--run", tmp_path / "begun", *sentence)
     assert "unfinished: its stage 'policy_vae' is not done" in line
 
 
@@ -89,7 +89,7 @@ def marked_finished(path: Path, configuration) -> Path:
 
 def test_a_missing_checkpoint_is_named(capsys, monkeypatch, tmp_path):
     path = marked_finished(tmp_path / "run", configs.smoke(configs.DEFAULT_ENVIRONMENT, 0))
-    line = refused(capsys, monkeypatch, generate, path, "I stay left")
+    line = refused(capsys, monkeypatch, generate, "--run", path, "I stay left")
     assert "there is no finished checkpoint at" in line
     assert str(path) in line
 
@@ -103,7 +103,7 @@ def test_a_run_of_another_version_is_refused(capsys, monkeypatch, tmp_path):
         ({"environment": "overcooked/gone"}, "unknown environment"),
     ):
         (path / "config.json").write_text(json.dumps({**stored, **change}))
-        line = refused(capsys, monkeypatch, generate, path, "I stay left")
+        line = refused(capsys, monkeypatch, generate, "--run", path, "I stay left")
         assert re.search(message, line), line
 
 
@@ -143,7 +143,7 @@ def test_an_output_whose_folder_is_missing_is_refused_first(
 ):
     sentence = ("I stay left",) if command is generate else ()
     line = refused(
-        capsys, monkeypatch, command, tmp_path / "run", *sentence, option, tmp_path / "no" / "file"
+        capsys, monkeypatch, command, *sentence, option, tmp_path / "no" / "file"
     )
     assert "does not exist; make it first" in line
     assert not (tmp_path / "no").exists()

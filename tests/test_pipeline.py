@@ -97,7 +97,7 @@ def run_command(monkeypatch, command, *arguments) -> None:
 def test_evaluate_measures_sentences_of_ones_own(monkeypatch, capsys, smoke_run, tmp_path):
     own, out = tmp_path / "mine.toml", tmp_path / "out.json"
     own.write_text('left_no_onion = ["I cook on the left.", "Bring me onions."]')
-    arguments = (smoke_run, "--instructions", own, "--json", out, "--games", 4)
+    arguments = ("--run", smoke_run, "--instructions", own, "--json", out, "--games", 4)
     run_command(monkeypatch, evaluate, *arguments)
     found = json.loads(out.read_text())
     assert list(found["styles"]) == ["left_no_onion"]
@@ -111,7 +111,7 @@ def test_evaluate_measures_sentences_of_ones_own(monkeypatch, capsys, smoke_run,
 
 def test_generate_plays_an_episode_and_draws_it(monkeypatch, capsys, smoke_run, tmp_path):
     gif = tmp_path / "episode.gif"
-    run_command(monkeypatch, generate, smoke_run, "I will cook on the left", "--gif", gif)
+    run_command(monkeypatch, generate, "--run", smoke_run, "I will cook on the left", "--gif", gif)
     shown = capsys.readouterr().out
     assert "I will cook on the left" in shown
     assert "ms" in shown
@@ -134,12 +134,12 @@ def copied_run(smoke_run, tmp_path):
 
 def test_a_sentence_must_hold_words_and_not_too_many(capsys, monkeypatch, smoke_run):
     for sentence, message in (("  ", "blank"), ("onion " * 60, "32")):
-        line = refused(capsys, monkeypatch, generate, smoke_run, sentence)
+        line = refused(capsys, monkeypatch, generate, "--run", smoke_run, sentence)
         assert message in line
 
 
 def test_an_unknown_style_is_refused_with_a_suggestion(capsys, monkeypatch, smoke_run):
-    line = refused(capsys, monkeypatch, generate, smoke_run, "I cook", "--style", "left_no_oninon")
+    line = refused(capsys, monkeypatch, generate, "--run", smoke_run, "I cook", "--style", "left_no_oninon")
     assert "did you mean 'left_no_onion'?" in line
 
 
@@ -161,7 +161,7 @@ def test_missing_encoder_weights_are_named(capsys, monkeypatch, copied_run):
     stored = json.loads((copied_run / "config.json").read_text())
     stored["encoder"] = str(copied_run / "no_such_bert")
     (copied_run / "config.json").write_text(json.dumps(stored))
-    line = refused(capsys, monkeypatch, generate, copied_run, "I stay left")
+    line = refused(capsys, monkeypatch, generate, "--run", copied_run, "I stay left")
     assert "no_such_bert" in line
 
 

@@ -123,7 +123,9 @@ class Visits:
 def load_vae(run: Run) -> tuple[PolicyVAE, Any, policy_vae.Posterior]:
     """The policy VAE, its parameters, and the archive's latents [policy, D]."""
     policies = partners.flatten(load_archive(run).egos.actor)
-    vae, params = init_vae(run, jax.random.key(0), policies)
+    one = jax.tree.map(lambda leaf: leaf[0], policies)
+    vae = PolicyVAE(PolicyArchitecture.from_params(one), run.config.compression.vae)
+    params = jax.eval_shape(vae.init, jax.random.key(0), one)
     latents = jnp.zeros((jax.tree.leaves(policies)[0].shape[0], vae.config.latent_dim))
     like = {"params": params, "mean": latents, "log_variance": latents}
     saved = checkpoint.restore(run.path("policy_vae", "vae"), like)
@@ -164,7 +166,9 @@ def load_diffusion(run: Run) -> DiffusionParams:
     """The fitted diffusion."""
     config, size = run.config.diffusion, run.config.diffusion.latent_size
     events = load_task_language(run).v_hat.shape[-1]
-    network = diffusion.init_network(jax.random.key(0), config, events)
+    network = jax.eval_shape(
+        lambda key: diffusion.init_network(key, config, events), jax.random.key(0)
+    )
     statistics = diffusion.LatentStatistics(jnp.zeros(size), jnp.ones(size))
     return checkpoint.restore(run.path("diffusion", "model"), DiffusionParams(network, statistics))
 
@@ -244,11 +248,15 @@ def load_haland(run: Run) -> Haland:
     config = run.config.translator
     language = load_task_language(run)
     encoder, tokenizer = load_pretrained(run)
-    fine_tuned = translator.init_fine_tuning(
-        jax.random.key(0), encoder, config, len(run.env.style_names)
+    events, styles = language.v_hat.shape[-1], len(run.env.style_names)
+    # Shapes alone: to compile and compute initial values would take most of the time.
+    fine_tuned, vae = jax.eval_shape(
+        lambda key: (
+            translator.init_fine_tuning(key, encoder, config, styles),
+            translator.init_translation(key, encoder.architecture, config, events),
+        ),
+        jax.random.key(0),
     )
-    events = language.v_hat.shape[-1]
-    vae = translator.init_translation(jax.random.key(0), encoder.architecture, config, events)
     saved = checkpoint.restore(
         run.path("translator", "model"), {"fine_tuned": fine_tuned, "vae": vae}
     )
