@@ -61,6 +61,7 @@ def made_up_results(others: tuple[str, ...] = ()) -> dict[str, Any]:
         "styles": STYLES,
         "methods": methods,
         "oracle": oracle,
+        "upper_bounds": dict.fromkeys(STYLES, 240.0),
         "gates": {
             "best responses on held-out partners": {"value": 0.96, "bar": 0.9, "met": True},
             "VAE reconstruction, worst policy": {"value": 0.93, "bar": 0.95, "met": False},

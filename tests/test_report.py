@@ -136,3 +136,16 @@ def test_the_terminal_table_shows_methods_and_gates(capsys):
     shown = capsys.readouterr().out
     assert "Haland, test sentences" in shown
     assert re.search(r"gate: VAE reconstruction, worst policy.*missed", shown)
+
+
+def test_the_table_by_style_holds_the_oracle_against_the_upper_bound(tmp_path):
+    results = made_up_results()
+    results["oracle"][STYLES[0]] = [180.0, 192.0]
+    text = section(report.write_report(results, tmp_path).read_text(), "By style")
+    head, _, first = text.splitlines()[:3]
+    assert head.endswith("| upper bound | Oracle / bound |")
+    assert first.endswith("| 240 | 0.78 |")  # 186 / 240
+
+    del results["upper_bounds"]
+    text = section(report.write_report(results, tmp_path).read_text(), "By style")
+    assert "upper bound" not in text
