@@ -7,7 +7,7 @@ import pytest
 
 import envs
 from envs.overcooked import layouts
-from envs.overcooked.styles import POOL_SIZE
+from envs.overcooked.moments import POOL_SIZE
 
 MAX_STEPS = 60
 

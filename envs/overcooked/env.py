@@ -9,7 +9,7 @@ import jax
 import jax.numpy as jnp
 
 from envs.base import Pair, TimeStep
-from envs.overcooked import dynamics, events, layouts, observation, reward, styles
+from envs.overcooked import dynamics, events, layouts, moments, observation, reward, styles
 from envs.overcooked.dynamics import State, Transition
 from envs.overcooked.layouts import Layout
 from envs.overcooked.reward import ShapingWeights
@@ -149,7 +149,7 @@ class Overcooked:
         """
         # Element 0 of the pool is the usual start; one draw decides whether and where.
         drawn = jax.random.uniform(key) / jnp.maximum(random_share, 1e-6)
-        index = jnp.where(drawn < 1, 1 + (drawn * (styles.POOL_SIZE - 1)).astype(jnp.int32), 0)
+        index = jnp.where(drawn < 1, 1 + (drawn * (moments.POOL_SIZE - 1)).astype(jnp.int32), 0)
         state = jax.tree.map(lambda leaf: leaf[index], style.pool)
         return state, self._first(state, style)
 

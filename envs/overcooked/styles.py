@@ -13,16 +13,13 @@ import jax.numpy as jnp
 import numpy as np
 from flax.struct import PyTreeNode
 
-from envs.overcooked import dynamics, events, paths, reward
+from envs.overcooked import dynamics, events, moments, paths, reward
 from envs.overcooked.dynamics import State
 from envs.overcooked.layouts import Layout
 
 FREE_STYLE = "free"
 """The only style of the classic kitchens: nothing is forbidden."""
 
-POOL_SIZE = 256
-FULL_POTS = 0.4
-"""Share of the pots that are full for certain in the moments to start from."""
 ITEM_KINDS = events.ITEM_KINDS
 
 
@@ -224,6 +221,7 @@ def build_style(layout: Layout, rule: Rule, *, max_steps: int) -> Style:
         pays = np.where(np.arange(len(stations))[:, None] == paying, ordered, 0.0)
         task = np.zeros(2 + len(serving), np.float32)
         task[[0 if content == 12 else 1, 1 + number]] = 1
+    wanted = tuple(int(content) for content in np.flatnonzero(pays.max(axis=0)))
     codes: dict[str, tuple[int, ...]] = {
         "onion": (dynamics.ONION,),
         "tomato": (dynamics.TOMATO,),
@@ -231,7 +229,16 @@ def build_style(layout: Layout, rule: Rule, *, max_steps: int) -> Style:
         "soup": tuple(dynamics.SOUP + content for content in layout.orders),
     }
     needed = tuple(code for kinds in rule.gives for kind in kinds for code in codes[kind])
-    pool = _start_pool(layout, start, role_cells, partner_cells, shared, needed, max_steps)
+    situation = moments.Situation(
+        start=start,
+        cells=np.stack(
+            [role_cells & _room(layout, start[0]), partner_cells & _room(layout, start[1])]
+        ),
+        shared=shared,
+        needed=needed,
+        wanted=wanted,
+        max_steps=max_steps,
+    )
     arrays: dict[str, Any] = {
         "cells": np.stack([np.ones_like(partner_cells), partner_cells]),
         "targets": np.stack([np.ones_like(partner_targets), partner_targets]),
@@ -248,7 +255,7 @@ def build_style(layout: Layout, rule: Rule, *, max_steps: int) -> Style:
                 paths.steps_around(layout, partner_cells, partner_targets),
             ]
         ).astype(np.int32),
-        "pool": pool,
+        "pool": moments.draw_pool(layout, situation),
     }
     return jax.tree.map(jnp.asarray, Style(**arrays))
 
@@ -323,73 +330,3 @@ def _welcome_items(rule: Rule) -> np.ndarray:
     if len(kinds) < 2:
         return np.full(4, np.inf, np.float32)
     return np.array([2, 2, 1, 1], np.float32)
-
-
-def _start_pool(
-    layout: Layout,
-    start: np.ndarray,
-    ego_cells: np.ndarray,
-    partner_cells: np.ndarray,
-    shared: np.ndarray,
-    needed: tuple[int, ...],
-    max_steps: int,
-) -> State:
-    """Draws moments to start from; computed once, since drawing on every reset is slow."""
-    random = np.random.default_rng(0)
-    moments = [jax.tree.map(np.asarray, dynamics.start_state(layout, jnp.asarray(start)))]
-    moments += [
-        _random_moment(layout, random, start, ego_cells, partner_cells, shared, needed, max_steps)
-        for _ in range(POOL_SIZE - 1)
-    ]
-    return jax.tree.map(lambda *leaves: np.stack(leaves), *moments)
-
-
-def _random_moment(
-    layout: Layout,
-    random: np.random.Generator,
-    start: np.ndarray,
-    ego_cells: np.ndarray,
-    partner_cells: np.ndarray,
-    shared: np.ndarray,
-    needed: tuple[int, ...],
-    max_steps: int,
-) -> State:
-    """A random moment of a game: places, hands, counters, pots and the time left.
-
-    On half of the shared counters lies something that one player needs from the other, so
-    that each can learn its part before the other has learnt to give.
-    """
-    soups = [dynamics.SOUP + content for content in layout.orders]
-    ingredients = [dynamics.ONION] + [dynamics.TOMATO] * layout.has_tomatoes
-    items = [*ingredients, dynamics.DISH, *soups]
-
-    def draw_items(size: int, share: float) -> np.ndarray:
-        drawn = random.choice(items, size)
-        return np.where(random.random(size) < share, drawn, dynamics.NO_ITEM).astype(np.int32)
-
-    partner_room = partner_cells & _room(layout, int(start[1]))
-    partner = random.choice(np.flatnonzero(partner_room))
-    ego_room = ego_cells & _room(layout, int(start[0]))
-    ego_room[partner] = False
-    ego = random.choice(np.flatnonzero(ego_room))
-    counters = draw_items(layout.num_counters, 0.1)
-    if needed:
-        offered = random.choice(needed, layout.num_counters)
-        counters = np.where(shared & (random.random(len(shared)) < 0.5), offered, counters)
-    amounts = random.integers(0, 4, layout.num_pots)
-    amounts = np.where(random.random(layout.num_pots) < FULL_POTS, 3, amounts)
-    units = random.choice([4, 1][: len(ingredients)], layout.num_pots)
-    cooking = (amounts == 3) & (random.random(layout.num_pots) < 0.7)
-    # Twice the cook time: half of the soups that were started are ready.
-    timer = random.integers(0, 2 * layout.cook_time + 1, layout.num_pots)
-    timer = np.minimum(timer, layout.cook_time)
-    arrays: dict[str, Any] = {
-        "cell": np.array([ego, partner], np.int32),
-        "orientation": random.integers(0, 4, 2).astype(np.int32),
-        "held": draw_items(2, 0.5),
-        "counters": counters.astype(np.int32),
-        "pot_content": (amounts * units).astype(np.int32),
-        "pot_timer": np.where(cooking, timer, dynamics.IDLE).astype(np.int32),
-        "time": np.array(random.integers(max(0, max_steps - 200), max_steps - 40), np.int32),
-    }
-    return State(**arrays)
