@@ -18,7 +18,7 @@ WEIGHTS = ShapingWeights(
     unordered_soup_taken=2.0,
     start_full=1.0,
     spoilt=-1.0,
-    unpaid_delivery=-1.0,
+    unordered_delivery=-1.0,
     hand_over=2.0,
     way=0.0,
 )
@@ -116,7 +116,7 @@ def test_taking_a_soup_pays_five_if_ordered_else_two(rooms, kitchen, inside, exp
     assert coordination_terms(rooms, kitchen.play("stay", "interact")) == expected
 
 
-def test_deliveries_pay_by_style_and_an_unpaid_one_costs_one(orders):
+def test_deliveries_pay_by_style_and_only_what_nobody_orders_is_fined(orders):
     style = orders.style("onion_2")
     for x, soup, pays in ((3, "ooo", 20), (1, "ooo", 0), (3, "ttt", 0), (3, "oo", 0)):
         kitchen = DrawnKitchen(orders.layout, style)
@@ -124,7 +124,7 @@ def test_deliveries_pay_by_style_and_an_unpaid_one_costs_one(orders):
         transition = kitchen.play("interact")
         paid = reward.delivery_reward(orders.layout, transition.interactions, style.pays)
         assert np.asarray(paid).tolist() == [pays, 0], (x, soup)
-        expected = {} if pays else {"unpaid_delivery": [-1, 0]}
+        expected = {"unordered_delivery": [-1, 0]} if soup == "oo" else {}
         assert terms(orders, "onion_2", transition) == expected
         assert kitchen.held(0) == 0, "the soup is gone either way"
 
@@ -189,7 +189,7 @@ def test_every_guided_term_was_seen_in_these_tests(rooms, kitchen):
     found = guided(rooms, rooms.style("left_no_onion"), kitchen.play())
     assert set(found) == {
         *("potting", "spoilt", "dish", "start_full", "soup_taken"),
-        *("unordered_soup_taken", "unpaid_delivery", "hand_over", "way"),
+        *("unordered_soup_taken", "unordered_delivery", "hand_over", "way"),
     }
 
 

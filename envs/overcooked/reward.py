@@ -39,7 +39,7 @@ class ShapingWeights:
     unordered_soup_taken: float = 2.0
     start_full: float = 3.0
     spoilt: float = -1.0
-    unpaid_delivery: float = -1.0
+    unordered_delivery: float = -1.0
     hand_over: float = 1.0
     way: float = 0.3
 
@@ -155,7 +155,8 @@ def guided_shaping_terms(
     started = did.change == dynamics.COOKING_STARTED
     taken = did.change == dynamics.SOUP_TAKEN
     delivered = did.change == dynamics.DELIVERED
-    unpaid = delivered & (delivery_reward(layout, did, pays) == 0)
+    # An ego that cannot see the order has to try: only what no order accepts is fined.
+    nonsense = delivered & ~jnp.isin(did.item - dynamics.SOUP, np.array(layout.orders))
 
     counter = jnp.minimum(did.station, layout.num_counters - 1)
     kind = jnp.clip(did.item, 1, dynamics.SOUP) - 1
@@ -176,7 +177,7 @@ def guided_shaping_terms(
         "start_full": weights.start_full * (started & complete),
         "soup_taken": weights.soup_taken * (taken & complete),
         "unordered_soup_taken": weights.unordered_soup_taken * (taken & ~complete),
-        "unpaid_delivery": weights.unpaid_delivery * unpaid,
+        "unordered_delivery": weights.unordered_delivery * nonsense,
         "hand_over": weights.hand_over * value * (put.astype(jnp.float32) - picked),
         "way": weights.way
         * jnp.full(
