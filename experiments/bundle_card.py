@@ -95,7 +95,7 @@ def _size_rows(sizes: Mapping[str, int]) -> list[tuple[str, str]]:
     return [*rows, ("all", f"{sum(sizes.values()) / MEGABYTE:.2f} MB")]
 
 
-def _loss_rows(losses: Mapping[str, Any]) -> list[tuple[str, str, str]]:
+def _loss_rows(losses: Mapping[str, Any]) -> list[tuple[str, ...]]:
     """What is compared, the run's value, and the bundle's (or the difference)."""
 
     def percent(value: float | None) -> str:
@@ -142,7 +142,7 @@ def card(
         f"# A trained model of {environment}",
         "",
         f"Exported on {about['exported']} from a run with preset `{run['preset']}`, seed "
-        f"{run['seed']}: {run['partners']['held_out_seeds']} held-out partners a style, with "
+        f"{run['seed']}: {run['partners']['held_out_seeds']} held-out partners of each style, with "
         "their Oracles, come along to play with. The translator was fine-tuned from "
         f"{encoder}.",
         "",
