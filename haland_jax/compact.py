@@ -1,9 +1,8 @@
 """Parameters in little space: large arrays in 8 bits, others in half precision.
 
-An array of at least `LARGE` numbers is stored as int8 codes with one step for each column (all
-entries that share their place on all axes but the first, the one that a layer sums over): an
-entry is off by at most half a step, 1/254 of the column's largest magnitude. Arrays of fewer
-than `SMALL` numbers, such as statistics and biases, take next to no space and stay float32.
+An array of at least `LARGE` numbers is stored as int8 codes with one step for each column (what
+the last but one axis runs over, along which a layer sums): an entry is off by at most half a step,
+1/254 of the column's largest magnitude. Arrays of fewer than `SMALL` numbers, such as statistics and biases, take next to no space and stay float32.
 """
 
 from collections.abc import Mapping
@@ -62,7 +61,7 @@ def unpack(packed: Mapping[str, np.ndarray]) -> dict[str, Any]:
 
 
 def _codes(array: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """int8 codes in [-127, 127] and float32 steps [1, ...] with array ≈ codes * steps."""
-    largest = np.abs(array).max(axis=0, keepdims=True)
+    """int8 codes in [-127, 127] and float32 steps [..., 1, column] with array ≈ codes * steps."""
+    largest = np.abs(array).max(axis=-2, keepdims=True)
     step = np.where(largest > 0, largest / _HIGHEST_CODE, 1.0).astype(np.float32)
     return np.rint(array / step).astype(np.int8), step

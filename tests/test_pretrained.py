@@ -56,6 +56,14 @@ def test_other_arrays_are_half_precision_and_small_ones_exact():
     np.testing.assert_array_equal(found["small"], tree["small"])
 
 
+def test_the_policies_of_an_archive_have_steps_of_their_own():
+    kernels = np.ones((2, 200, 100), np.float32)
+    kernels[1] *= 1000
+    packed = compact.pack({"archive": kernels})
+    assert packed["archive:step"].shape == (2, 1, 100)
+    np.testing.assert_allclose(compact.unpack(packed)["archive"], kernels, rtol=1e-6)
+
+
 def test_a_column_of_zeros_stays_zero():
     kernel = np.ones((200, 200), np.float32)
     kernel[:, 3] = 0
@@ -109,9 +117,9 @@ def test_a_bundle_gives_back_its_model(smoke_bundle):
     for name in ("held_out_partners", "oracles"):
         now, before = getattr(found, name), getattr(model, name)
         assert jax.tree.structure(now) == jax.tree.structure(before)
-        jax.tree.map(
-            lambda a, b: np.testing.assert_allclose(a, b, rtol=1e-3, atol=1e-4), now, before
-        )
+        for a, b in zip(jax.tree.leaves(now), jax.tree.leaves(before), strict=True):
+            # Half a step of the largest magnitude, or half precision.
+            np.testing.assert_allclose(a, b, rtol=1e-3, atol=0.51 / 127 * float(np.abs(b).max()))
     sentences = ["I stay on the left.", "No dishes for me."]
     difference = found.haland.translate(sentences)[0] - model.haland.translate(sentences)[0]
     assert 0 < float(jnp.abs(difference).max()) < 0.02
