@@ -2,7 +2,8 @@
 
 An array of at least `LARGE` numbers is stored as int8 codes with one step for each column (what
 the last but one axis runs over, along which a layer sums): an entry is off by at most half a step,
-1/254 of the column's largest magnitude. Arrays of fewer than `SMALL` numbers, such as statistics and biases, take next to no space and stay float32.
+1/254 of the column's largest magnitude. Arrays of fewer than `SMALL` numbers, such as statistics
+and biases, take next to no space and stay float32.
 """
 
 from collections.abc import Mapping
