@@ -127,9 +127,9 @@ def train_chunk(
     Returns:
         The new state, and metrics of each update, float32 [num_updates]: `reward`, team reward
         a step; `return`, team reward a game; `shaped`, the mean shaped reward a step; `loss`,
-        the mean loss of those who learn. Where games end by their own rules, the return is reward / games ended;
-        elsewhere it is what a whole game of such steps would bring, since games that go on
-        from a random moment are shorter.
+        the mean loss of those who learn. Where games end by their own rules, the return is
+        reward / games ended; elsewhere it is what a whole game of such steps would bring, since
+        games that go on from a random moment are shorter.
     """
 
     def one_update(state: TrainState, _: None):

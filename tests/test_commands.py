@@ -34,7 +34,10 @@ def in_this_process(monkeypatch, tmp_path):
     [
         (("--env", "overcooked/crossways"), "unknown environment .*mean 'overcooked/crossway'"),
         (("--env", "overcooked/cramped_room"), "unknown environment 'overcooked/cramped_room'"),
-        (("--preset", "fast"), "unknown preset 'fast'; expected one of smoke, quick, overnight, paper"),
+        (
+            ("--preset", "fast"),
+            "unknown preset 'fast'; expected one of smoke, quick, overnight, paper",
+        ),
         (("--seed", "-1"), "seed is -1; expected 0 or more"),
     ],
 )
@@ -142,9 +145,7 @@ def test_an_output_whose_folder_is_missing_is_refused_first(
     capsys, monkeypatch, tmp_path, command, option
 ):
     sentence = ("I stay left",) if command is generate else ()
-    line = refused(
-        capsys, monkeypatch, command, *sentence, option, tmp_path / "no" / "file"
-    )
+    line = refused(capsys, monkeypatch, command, *sentence, option, tmp_path / "no" / "file")
     assert "does not exist; make it first" in line
     assert not (tmp_path / "no").exists()
 

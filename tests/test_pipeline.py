@@ -139,7 +139,9 @@ def test_a_sentence_must_hold_words_and_not_too_many(capsys, monkeypatch, smoke_
 
 
 def test_an_unknown_style_is_refused_with_a_suggestion(capsys, monkeypatch, smoke_run):
-    line = refused(capsys, monkeypatch, generate, "--run", smoke_run, "I cook", "--style", "left_no_oninon")
+    line = refused(
+        capsys, monkeypatch, generate, "--run", smoke_run, "I cook", "--style", "left_no_oninon"
+    )
     assert "did you mean 'left_no_onion'?" in line
 
 
