@@ -2,6 +2,7 @@
 
     python -m experiments.benchmark env                   Overcooked against JaxMARL's
     python -m experiments.benchmark env --json out.json
+    python -m experiments.benchmark lbf                   level-based foraging against Jumanji's
     python -m experiments.benchmark ppo                   training pairs of players
 
 Absolute figures drift with the machine's load; ratios of one run hold.
@@ -26,7 +27,7 @@ from rich.console import Console
 from rich.table import Table
 
 import envs
-from experiments import contenders, devices
+from experiments import benchmark_lbf, contenders, contenders_lbf, devices
 from experiments.configs import DEFAULT_ENVIRONMENT, PRESETS
 from experiments.contenders import PEER, PEER_PLAIN
 from experiments.errors import UserError, choose, main_guard
@@ -65,6 +66,30 @@ class EnvArguments:
 
 
 @dataclasses.dataclass(frozen=True)
+class LbfArguments:
+    """Measure level-based foraging on random fields of 15 x 15 cells, two players, eight foods.
+
+    Ours with each observation and Jumanji's with the same kind (where it is installed) take
+    turns in one process, the games shared out over one device a core; both start again on a
+    new field. "our restart" leaves out Jumanji's reset at every step, as our loop does; the
+    bars are set against Jumanji as it is.
+    """
+
+    encodings: tuple[str, ...] = tuple(contenders_lbf.ENCODINGS)
+    """Our observations to measure."""
+    batch: int = 512
+    """Games played at once."""
+    steps: int = 300
+    """Steps of each game in one repeat; games last 100 steps and start again."""
+    repeats: int = 5
+    """Repeats of each; the fastest counts."""
+    cores: int = 2
+    """Cores to use."""
+    json: Annotated[Path | None, tyro.conf.arg(metavar="OUT")] = None
+    """Write the result as JSON too."""
+
+
+@dataclasses.dataclass(frozen=True)
 class PpoArguments:
     """Measure PPO with both players learning, all styles and four seeds in one program.
 
@@ -85,6 +110,7 @@ class PpoArguments:
 
 Arguments = (
     Annotated[EnvArguments, tyro.conf.subcommand("env")]
+    | Annotated[LbfArguments, tyro.conf.subcommand("lbf")]
     | Annotated[PpoArguments, tyro.conf.subcommand("ppo")]
 )
 
@@ -174,7 +200,8 @@ def machine() -> dict[str, Any]:
         lines = Path("/proc/cpuinfo").read_text().splitlines()
         names = [line.split(":", 1)[1].strip() for line in lines if line.startswith("model name")]
         processor = names[0] if names else processor
-    packages = ("jax", "jaxlib", *(("jaxmarl",) if contenders.has_peer() else ()))
+    peers = (("jaxmarl", contenders), ("jumanji", contenders_lbf))
+    packages = ("jax", "jaxlib", *(name for name, module in peers if module.has_peer()))
     return {
         "processor": processor,
         "devices": f"{len(jax.devices())} x {jax.devices()[0].device_kind}",
@@ -241,7 +268,7 @@ def _prepare(cores: int | None) -> None:
     jax.config.update("jax_enable_compilation_cache", False)
 
 
-def _check(arguments: EnvArguments | PpoArguments) -> None:
+def _check(arguments: EnvArguments | LbfArguments | PpoArguments) -> None:
     for field in dataclasses.fields(arguments):
         value = getattr(arguments, field.name)
         if isinstance(value, int) and value < 1:
@@ -251,8 +278,12 @@ def _check(arguments: EnvArguments | PpoArguments) -> None:
     if isinstance(arguments, PpoArguments):
         choose("environment", arguments.env, envs.names(styled_only=True))
         return
-    for kitchen in arguments.kitchens:
-        choose("kitchen", kitchen, KITCHENS)
+    if isinstance(arguments, LbfArguments):
+        for encoding in arguments.encodings:
+            choose("encoding", encoding, tuple(contenders_lbf.ENCODINGS))
+    else:
+        for kitchen in arguments.kitchens:
+            choose("kitchen", kitchen, KITCHENS)
     if arguments.batch % arguments.cores:
         raise UserError(
             f"batch is {arguments.batch}; expected a multiple of cores = {arguments.cores}"
@@ -270,6 +301,13 @@ def main() -> None:
         found = measure_ppo(arguments.env, arguments.updates, arguments.repeats)
         found["machine"] = machine()
         console.print(ppo_table(found))
+    elif isinstance(arguments, LbfArguments):
+        batch, steps = arguments.batch, arguments.steps
+        engines = benchmark_lbf.measure_fields(arguments.encodings, batch, steps, arguments.repeats)
+        found = {"batch": batch, "steps": steps, "engines": engines, "machine": machine()}
+        console.print(benchmark_lbf.lbf_table(found))
+        if not contenders_lbf.has_peer():
+            console.print(benchmark_lbf.INSTALL_PEER, highlight=False)
     else:
         measure = functools.partial(
             measure_kitchen,

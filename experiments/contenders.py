@@ -1,4 +1,4 @@
-"""The games that the benchmark plays: ours and JaxMARL's, in the same loop."""
+"""The games that the benchmark plays: ours and JaxMARL's Overcooked, in the same loop."""
 
 import dataclasses
 import importlib
@@ -36,20 +36,25 @@ class Contender:
     advance: Callable[[Any, jax.Array], tuple[Any, jax.Array]]
 
 
-def _random_actions(key: jax.Array, batch: int) -> Pair:
+def random_actions(key: jax.Array, batch: int) -> Pair:
     """Uniform actions of both players from one draw, int32 [batch] each."""
     both = jax.random.randint(key, (batch,), 0, 36)
     return Pair(both // 6, both % 6)
 
 
-def _restart(first: Any, following: Any, done: jax.Array) -> Any:
-    """Puts `first` in the place of finished games; touches nothing while all go on."""
+def restart(first: Any, following: Any, done: jax.Array) -> Any:
+    """Puts `first` in the place of finished games."""
 
     def put(start: jax.Array, now: jax.Array) -> jax.Array:
         return jnp.where(done.reshape(-1, *[1] * (now.ndim - 1)), start, now)
 
+    return jax.tree.map(put, first, following)
+
+
+def _restart_if_any(first: Any, following: Any, done: jax.Array) -> Any:
+    """Like `restart`; touches nothing while all games go on."""
     return jax.lax.cond(
-        jnp.any(done), lambda now: jax.tree.map(put, first, now), lambda now: now, following
+        jnp.any(done), lambda now: restart(first, now, done), lambda now: now, following
     )
 
 
@@ -66,11 +71,11 @@ def our_games(kitchen: str, encoding: str) -> Contender:
     first = (state, timestep.observation)
 
     def advance(carried: Any, key: jax.Array) -> tuple[Any, jax.Array]:
-        actions = _random_actions(key, carried[0].time.shape[0])
+        actions = random_actions(key, carried[0].time.shape[0])
         step = jax.vmap(lambda state, actions: env.step(unused, state, actions, style))
         state, timestep = step(carried[0], actions)
         following = (state, timestep.observation)
-        return _restart(first, following, timestep.done), timestep.reward
+        return _restart_if_any(first, following, timestep.done), timestep.reward
 
     return Contender(f"ours, {encoding}", lambda key, batch: _repeated(first, batch), advance)
 
@@ -87,13 +92,13 @@ def peer_games(kitchen: str, *, own_reset: bool) -> Contender:
     def advance(carried: Any, key: jax.Array) -> tuple[Any, jax.Array]:
         batch = carried[0].step.shape[0]
         action_key, step_key = jax.random.split(key)
-        actions = dict(zip(env.agents, _random_actions(action_key, batch), strict=True))
+        actions = dict(zip(env.agents, random_actions(action_key, batch), strict=True))
         keys = jax.random.split(step_key, batch)
         step = env.step if own_reset else env.step_env
         observation, state, reward, done, _ = jax.vmap(step)(keys, carried[0], actions)
         following = (state, observation)
         if not own_reset:
-            following = _restart(first, following, done["__all__"])
+            following = _restart_if_any(first, following, done["__all__"])
         return following, reward["agent_0"]
 
     name = PEER if own_reset else PEER_PLAIN

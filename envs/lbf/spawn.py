@@ -67,21 +67,20 @@ def random_field(key: jax.Array, rules: Rules, spawning: Spawning) -> State:
     last = np.array([rules.rows - 1, rules.columns - 1])
     numbers = jax.random.uniform(place_key, (spawning.num_players + spawning.num_foods,))
 
-    places, free = [], jnp.ones(len(cells), bool)
-    for number in numbers[: spawning.num_players]:
+    def put_player(free: jax.Array, number: jax.Array):
         place, _ = _draw_cell(number, free, cells)
-        free &= jnp.any(cells != place, axis=1)
-        places.append(place)
+        return free & jnp.any(cells != place, axis=1), place
 
-    food_places, found = [], []
-    free &= jnp.asarray(((cells > 0) & (cells < last)).all(axis=1))
-    for number in numbers[spawning.num_players :]:
-        place, any_free = _draw_cell(number, free, cells)
+    def put_food(free: jax.Array, number: jax.Array):
+        place, found = _draw_cell(number, free, cells)
         away = jnp.abs(cells - place)
         in_line = (jnp.min(away, axis=1) == 0) & (jnp.max(away, axis=1) == 2)
-        free &= ~((jnp.max(away, axis=1) <= 1) | in_line)
-        food_places.append(place)
-        found.append(any_free)
+        return free & (jnp.max(away, axis=1) > 1) & ~in_line, (place, found)
+
+    free = jnp.ones(len(cells), bool)
+    free, place = jax.lax.scan(put_player, free, numbers[: spawning.num_players])
+    free &= ((cells > 0) & (cells < last)).all(axis=1)
+    _, (food_place, found) = jax.lax.scan(put_food, free, numbers[spawning.num_players :])
 
     level = jax.random.randint(
         player_key, (spawning.num_players,), 1, spawning.max_player_level + 1
@@ -91,11 +90,11 @@ def random_field(key: jax.Array, rules: Rules, spawning: Spawning) -> State:
         greatest = jnp.asarray(spawning.max_food_level)
     least = greatest if spawning.force_coop else 1
     food_level = jax.random.randint(food_key, (spawning.num_foods,), least, greatest + 1)
-    food_level = jnp.where(jnp.stack(found), food_level, 0)
+    food_level = jnp.where(found, food_level, 0)
     return State(
-        place=jnp.stack(places),
+        place=place,
         level=level,
-        food_place=jnp.stack(food_places),
+        food_place=food_place,
         food_level=food_level,
         time=jnp.zeros((), jnp.int32),
         food_total=jnp.sum(food_level),
