@@ -97,30 +97,37 @@ def grid(rules: Rules, state: State) -> jax.Array:
     entered; the player itself is in the centre, and what lies outside the field is 0. Two
     players on one cell show the level of the later one, as in the reference.
     """
-    reach = rules.reach
+    barrier = jax.lax.optimization_barrier
+    reach, num_players = rules.reach, len(state.place)
     side = 2 * reach + 1
-    steps = np.arange(side) - reach
-    across = np.arange(side * side)
+    in_window = np.arange(side) - reach
+    # Half as wide integers, where they are wide enough, are compared in half the time.
+    kind = jnp.int16 if side * side < 2**15 else jnp.int32
+    cells = np.arange(side * side, dtype=kind)
 
-    def window_key(place: jax.Array, own: jax.Array) -> jax.Array:
-        """Index of cells in a player's window, -1 outside."""
-        away = place - own
+    def window_cell(place: jax.Array) -> jax.Array:
+        """Which cell of each player's window a thing is on, -1 outside, [player, thing]."""
+        away = place - state.place[:, None]
         inside = jnp.all(jnp.abs(away) <= reach, axis=-1)
-        return jnp.where(inside, (away[..., 0] + reach) * side + away[..., 1] + reach, -1)
+        cell = jnp.where(inside, (away[..., 0] + reach) * side + away[..., 1] + reach, -1)
+        return cell.astype(kind)
 
-    def one(own: jax.Array) -> jax.Array:
-        players, foods = jnp.zeros(side * side, jnp.int32), jnp.zeros(side * side, jnp.int32)
-        player_keys, food_keys = window_key(state.place, own), window_key(state.food_place, own)
-        for index in range(len(state.level)):
-            players = jnp.where(across == player_keys[index], state.level[index], players)
-        for index in range(len(state.food_level)):
-            foods = jnp.where(across == food_keys[index], state.food_level[index], foods)
-        row, column = own[0] + steps, own[1] + steps
-        inside = ((row >= 0) & (row < rules.rows))[:, None] & (
-            (column >= 0) & (column < rules.columns)
-        )
-        free = inside.ravel() & (players == 0) & (foods == 0)
-        layers = jnp.stack([players, foods, free.astype(jnp.int32)]).astype(jnp.int8)
-        return layers.reshape(3, side, side)
-
-    return jax.vmap(one)(state.place)
+    row, column = (state.place[:, axis, None] + in_window for axis in (0, 1))
+    row_inside = (row >= 0) & (row < rules.rows)
+    column_inside = (column >= 0) & (column < rules.columns)
+    # The barriers keep XLA on a CPU from computing what is small anew for every cell, and from
+    # choosing a layer at every cell.
+    there = jnp.where(state.food_level > 0, window_cell(state.food_place), -1)
+    small = (window_cell(state.place), there, state.level, state.food_level)
+    small = jax.tree.map(lambda part: part.astype(kind), (*small, row_inside, column_inside))
+    player_cell, food_cell, level, food_level, row_inside, column_inside = barrier(small)
+    players = foods = jnp.zeros((num_players, side * side), kind)
+    for index in range(num_players):
+        players = jnp.where(cells == player_cell[:, index, None], level[index], players)
+    for index in range(len(state.food_level)):
+        foods = jnp.where(cells == food_cell[:, index, None], food_level[index], foods)
+    field = (row_inside[:, :, None] * column_inside[:, None]).reshape(num_players, -1)
+    players, foods, field = barrier((players, foods, field))
+    free = barrier(jnp.where((players | foods) == 0, field, 0))
+    layers = jnp.stack([players, foods, free], axis=1).astype(jnp.int8)
+    return layers.reshape(num_players, 3, side, side)
