@@ -164,13 +164,14 @@ def measure_ppo(environment: str, updates: int, repeats: int, config: Any = None
             default.
     """
     from haland_jax import partners
+    from haland_jax.population import share_out
 
     env = envs.make(environment)
     if config is None:
         quick = PRESETS["quick"](environment, 0).partners
         config = dataclasses.replace(quick, train_seeds=3, held_out_seeds=1, spare_seeds=0)
-    state = partners.place(partners.init_pairs(env, config, jax.random.key(0)))
-    styles = partners.place(partners.repeat_styles(env, config.num_seeds))
+    state = share_out(partners.init_pairs(env, config, jax.random.key(0)))
+    styles = share_out(partners.repeat_styles(env, config.num_seeds))
     begin = time.perf_counter()
     train = partners.compile_training(env, config.joint, updates).lower(state, styles).compile()
     compile_seconds = time.perf_counter() - begin

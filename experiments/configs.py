@@ -77,12 +77,13 @@ class RunConfig:
         max_steps: steps of a game.
         encoder: folder or hub name of a BERT checkpoint; empty for the packaged MiniLM.
         partners: partners and best responses (stage 1).
-        task_language_games: games of each pair from which Eq. 8's frequencies are counted.
+        task_language_games: games of each pair from which Eq. 8's frequencies are counted
+            (stage 2).
         compression: policy VAE (stage 3).
         diffusion: latent diffusion (stage 4).
         translator: sentence translator (stage 5).
-        universal: egos for the partners of all styles, told the style or not (stage 6).
-        evaluation: what is measured (stage 7).
+        universal: egos for the partners of all styles, told the style or not (stage 1).
+        evaluation: what is measured (stage 6).
     """
 
     environment: str
@@ -194,6 +195,7 @@ def quick(environment: str, seed: int) -> RunConfig:
             refit=refit_config(400_000, num_envs=36, partner_noise=0.1),
             oracle=refit_config(200_000),
             oracle_candidates=2,
+            universal_start=False,
         ),
         compression=CompressionConfig(
             fit=FitConfig(learning_rate=1e-2, steps=1500, warmup_steps=50)

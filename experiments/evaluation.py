@@ -79,8 +79,8 @@ def evaluate(run: Run, task: StageProgress) -> dict[str, Any]:
     right = nearest_is_right(haland, translated[TEST_SENTENCES])
     upper_bounds = env.upper_bounds()
     gate = policy_vae_gate(run, judge, next(keys))
-    for method, policies in zip(COMPARISONS, load_universal(run).values(), strict=True):
-        results[method] = judge.with_held_out(next(keys), policies, held_out).mean(axis=2)
+    for method, players in zip(COMPARISONS, load_universal(run).values(), strict=True):
+        results[method] = judge.with_held_out(next(keys), players.actor, held_out).mean(axis=2)
         task.update(task.done + 1)
     return {
         "methods": {

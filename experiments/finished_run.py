@@ -6,7 +6,7 @@ from typing import Any
 from experiments.configs import PRESETS, RunConfig
 from experiments.errors import UserError, as_user_error
 from experiments.run_folder import RunFolder
-from experiments.stages import POLICY_STAGES, Run
+from experiments.stages import STAGE_NAMES, Run
 from haland_jax.configuration import filled
 
 
@@ -19,7 +19,7 @@ def open_run(path: Path) -> Run:
     Raises:
         UserError: there is no finished run, or it was made by another version's preset.
     """
-    folder = RunFolder.read(path, POLICY_STAGES)
+    folder = RunFolder.read(path, STAGE_NAMES)
     with as_user_error():
         return Run(_configuration(path, folder.configuration), folder)
 

@@ -82,6 +82,9 @@ def collect_results(run: Run) -> dict[str, Any]:
             name: metrics["partners"][name]
             for name in ("joint_returns", "kept_for_training", "kept_held_out")
         },
+        "best_responses": {
+            name: metrics["best_responses"][name] for name in ("starts", "start_returns")
+        },
         "times": {name: values["seconds"] for name, values in metrics.items()},
         "machine": describe_machine(),
     }
@@ -92,7 +95,9 @@ def _universal(run: Run, measured: dict[str, Any]) -> dict[str, Any]:
     config = run.config.partners
     styles = len(run.env.style_names)
     pairs = styles * config.num_seeds * config.joint.num_updates * config.joint.steps_per_update
-    refits = styles * config.train_seeds * config.refit.num_updates * config.refit.steps_per_update
+    starts = 2 if config.universal_start else 1
+    refits = styles * starts * config.train_seeds
+    refits *= config.refit.num_updates * config.refit.steps_per_update
     kept = ("steps", "seeds", "curve_steps", "curve_returns")
     return {**{name: measured[name] for name in kept}, "best_response_steps": pairs + refits}
 

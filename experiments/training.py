@@ -16,6 +16,7 @@ from envs.base import Environment
 from experiments.progress import StageProgress
 from haland_jax import checkpoint, fit, partners
 from haland_jax.fit import FitConfig, FitState
+from haland_jax.population import share_out
 from haland_jax.ppo import PPOConfig, TrainState
 
 SECONDS_BETWEEN_CHECKPOINTS = 20.0
@@ -72,7 +73,7 @@ def train_population(
     saved = saver.restore({"state": state, "returns": returns})
     if saved is not None:
         state, returns = saved["state"], np.array(saved["returns"])
-    state, styles = partners.place(state), partners.place(styles)
+    state, styles = share_out(state), share_out(styles)
     compiled: dict[int, Callable[..., Any]] = {}
     done = int(np.asarray(state.update)[0])
     while done < config.num_updates:

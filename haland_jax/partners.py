@@ -1,13 +1,8 @@
-"""Styled partners and their best responses.
+"""Styled partners, and the egos that learn beside them.
 
-1. Partner and ego learn together, many seeds of every style in one program (`init_pairs`).
-2. The best seeds of each style are kept, by one rule for training and held-out seeds alike
-   (`select_seeds`): partners that never learnt their style are no partners.
-3. Each training ego is refitted against *all* frozen training partners of its style
-   (`init_refits`): an ego that knew one partner only keeps that partner's private conventions.
-   These refitted egos are the archive.
-4. The Oracle of a held-out partner is the best of a few egos of its style refitted to that
-   very partner (`oracle_candidates`), chosen on other games than those it is scored on.
+Partner and ego learn together, many seeds of every style in one program (`init_pairs`). The best
+seeds of each style are kept, by one rule for training and held-out seeds alike (`select_seeds`):
+partners that never learnt their style are no partners.
 
 Everything is flattened to members [style * seed] for `over_population`.
 """
@@ -25,7 +20,7 @@ from flax.struct import PyTreeNode
 from envs.base import Environment
 from haland_jax import ppo, rollout
 from haland_jax.networks import Policy
-from haland_jax.population import over_population, share_out
+from haland_jax.population import over_population
 from haland_jax.ppo import PPOConfig, TrainState
 
 
@@ -62,6 +57,7 @@ class PartnersConfig:
         refit: training of an ego against all frozen training partners of its style.
         oracle: training of an ego against one frozen held-out partner.
         oracle_candidates: egos that are refitted for each held-out partner.
+        universal_start: also refit the universal ego, and keep the better start of each style.
         evaluation_games: games of each pair in an evaluation.
     """
 
@@ -74,6 +70,7 @@ class PartnersConfig:
     )
     oracle: PPOConfig = dataclasses.field(default_factory=lambda: refit_config(300_000))
     oracle_candidates: int = 3
+    universal_start: bool = True
     evaluation_games: int = 32
 
     def __post_init__(self):
@@ -166,33 +163,6 @@ def init_pairs(env: Environment, config: PartnersConfig, key: jax.Array) -> Trai
     return over_population(init_pair, shared=1)(ego_key, keys, styles)
 
 
-def init_refits(
-    env: Environment,
-    config: PPOConfig,
-    key: jax.Array,
-    egos: Player,
-    partners: Policy,
-    styles: Any,
-) -> TrainState:
-    """Starts the refit of egos against frozen partners.
-
-    Args:
-        env: the environment.
-        config: settings of the refit.
-        key: consumed.
-        egos: where each refit starts, leading axis [member].
-        partners: frozen actors, leading axes [member, partner]; they share the games.
-        styles: style of each member.
-    """
-
-    def init_refit(key, ego, partners, style):
-        learner = ppo.learner_from(ego.actor, ego.critic, config)
-        return ppo.init_train_state(env, config, key, learner, partners, style)
-
-    keys = jax.random.split(key, jax.tree.leaves(styles)[0].shape[0])
-    return over_population(init_refit)(keys, egos, partners, styles)
-
-
 def compile_training(
     env: Environment, config: PPOConfig, num_updates: int
 ) -> Callable[[TrainState, Any], tuple[TrainState, dict[str, jax.Array]]]:
@@ -265,65 +235,6 @@ def make_population(
     )
 
 
-def best_response_refits(
-    env: Environment, config: PartnersConfig, key: jax.Array, population: Population
-) -> TrainState:
-    """Starts the refits that become the archive, leading axis [style * train_seeds]."""
-    times = config.train_seeds
-    partners = jax.tree.map(
-        lambda leaf: jnp.repeat(leaf[:, None], times, axis=1), population.train_partners
-    )
-    return init_refits(
-        env,
-        config.refit,
-        key,
-        flatten(population.train_egos),
-        flatten(partners),
-        repeat_styles(env, times),
-    )
-
-
-def oracle_refits(
-    env: Environment,
-    config: PartnersConfig,
-    key: jax.Array,
-    population: Population,
-    archived: Player,
-) -> TrainState:
-    """Starts the Oracle's candidates, leading axis [style * held_out_seeds * candidates].
-
-    The candidates of a held-out partner are its own ego and archived best responses of its
-    style (in turn), so that no archived ego can beat the Oracle but by chance.
-
-    Args:
-        env: the environment.
-        config: how many candidates.
-        key: consumed.
-        population: the held-out partners and their egos.
-        archived: the refitted egos, leading axes [style, train_seeds].
-    """
-    others = config.oracle_candidates - 1
-    seeds = config.held_out_seeds
-    chosen = (np.arange(seeds)[:, None] + np.arange(others)) % config.train_seeds
-
-    def candidates(own: jax.Array, archive: jax.Array) -> jax.Array:
-        return jnp.concatenate([own[:, :, None], archive[:, chosen]], axis=2)
-
-    egos = jax.tree.map(candidates, population.held_out_egos, archived)
-    partners = jax.tree.map(
-        lambda leaf: jnp.repeat(leaf[:, :, None, None], config.oracle_candidates, axis=2),
-        population.held_out_partners,
-    )
-    return init_refits(
-        env,
-        config.oracle,
-        key,
-        flatten(flatten(egos)),
-        flatten(flatten(partners)),
-        repeat_styles(env, seeds * config.oracle_candidates),
-    )
-
-
 def visited_observations(
     env: Environment,
     key: jax.Array,
@@ -348,8 +259,3 @@ def visited_observations(
     alive = games.alive.reshape(-1).astype(jnp.float32)
     drawn = jax.random.choice(draw_key, alive.shape[0], (num_kept,), p=alive / jnp.sum(alive))
     return observations[drawn]
-
-
-def place(population: Any) -> Any:
-    """Puts a population onto the devices."""
-    return share_out(population)

@@ -18,11 +18,12 @@ import jax.numpy as jnp
 from envs.labelled import Labelled
 from haland_jax import ppo
 from haland_jax.networks import Policy
-from haland_jax.partners import flatten
+from haland_jax.partners import Player, flatten
 from haland_jax.population import over_population
 from haland_jax.ppo import PPOConfig, StylesByGame, TrainState
 
-VARIANTS = ("told nothing", "told the style")
+TOLD_NOTHING, TOLD_THE_STYLE = "told nothing", "told the style"
+VARIANTS = (TOLD_NOTHING, TOLD_THE_STYLE)
 
 
 def universal_config(total_steps: int, num_envs: int = 192, num_minibatches: int = 8) -> PPOConfig:
@@ -106,38 +107,42 @@ def init_universal(
     return over_population(init_ego, shared=1)(everyone, keys, member_styles(env, config.seeds))
 
 
-def fold_label(policy: Policy, label: jax.Array) -> Policy:
-    """The policy of the plain observation that plays as `policy` does with a label.
+def fold_label(params: Any, label: jax.Array) -> Any:
+    """The network of the plain observation that says what `params` says with a label.
 
     The first layer takes the label up, so that an ego that was told the style is a policy
     like any other.
 
     Args:
-        policy: an ego of a `Labelled` environment, without leading axes.
+        params: an actor or critic of a `Labelled` environment, without leading axes.
         label: what it is told, float32 [style].
     """
-    first = policy["params"]["dense_0"]
+    first = params["params"]["dense_0"]
     rest = first["kernel"].shape[0] - label.shape[0]
     kernel, told = first["kernel"][:rest], first["kernel"][rest:]
     folded = {**first, "kernel": kernel, "bias": first["bias"] + label @ told}
-    return {**policy, "params": {**policy["params"], "dense_0": folded}}
+    return {**params, "params": {**params["params"], "dense_0": folded}}
 
 
-def policies_by_style(env: Labelled, egos: Policy) -> dict[str, Policy]:
-    """The policies that each variant plays with partners of each style.
+def players_by_style(env: Labelled, egos: Player) -> dict[str, Player]:
+    """The players that each variant is with partners of each style.
 
     Args:
         env: the environment, with labels.
-        egos: trained actors, leading axis [variant * seed].
+        egos: trained egos, leading axis [variant * seed].
 
     Returns:
-        By variant, policies of the plain observation, leading axes [style, seed].
+        By variant, players with the plain observation, leading axes [style, seed].
     """
     labels = (env.hidden_styles.label, env.styles.label)
     by_variant: Any = jax.tree.map(
         lambda leaf: leaf.reshape(len(VARIANTS), -1, *leaf.shape[1:]), egos
     )
-    over_seeds = jax.vmap(fold_label, in_axes=(0, None))
+
+    def fold(ego: Player, label: jax.Array) -> Player:
+        return Player(fold_label(ego.actor, label), fold_label(ego.critic, label))
+
+    over_seeds = jax.vmap(fold, in_axes=(0, None))
     over_styles = jax.vmap(over_seeds, in_axes=(None, 0))
     return {
         name: over_styles(jax.tree.map(lambda leaf, i=index: leaf[i], by_variant), labels[index])

@@ -15,11 +15,11 @@ from toy_game import ToyGame
 
 from experiments import configs, devices, evaluate, generate, run, training
 from experiments.run_folder import RunFolder
+from experiments.stages import STAGE_NAMES
 from haland_jax import partners
 from haland_jax.fit import NonFiniteLoss
 
 ROOT = Path(__file__).parent.parent
-STAGES = ("partners", "best_responses", "task_language", "policy_vae", "diffusion", "translator")
 
 
 @pytest.fixture(autouse=True)
@@ -76,16 +76,16 @@ def test_a_missing_or_unfinished_run_is_named(capsys, monkeypatch, tmp_path, com
     assert "nowhere is missing; make a run with python -m experiments.run" in line
     assert not (tmp_path / "nowhere").exists()
     with RunFolder.write(tmp_path / "begun", configs.smoke(configs.DEFAULT_ENVIRONMENT, 0)) as run_:
-        for stage in STAGES[:3]:
+        for stage in STAGE_NAMES[:3]:
             run_.finish_stage(stage, {})
     line = refused(capsys, monkeypatch, command, "--run", tmp_path / "begun", *sentence)
-    assert "unfinished: its stage 'policy_vae' is not done" in line
+    assert "unfinished: its stage 'task_language' is not done" in line
 
 
 def marked_finished(path: Path, configuration) -> Path:
     """A folder that says of every stage that it is done, without any checkpoint."""
     with RunFolder.write(path, configuration) as folder:
-        for stage in STAGES:
+        for stage in STAGE_NAMES:
             folder.finish_stage(stage, {})
     return path
 

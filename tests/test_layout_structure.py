@@ -18,6 +18,7 @@ ORDER = (
     "ppo",
     "partners",
     "universal",
+    "best_responses",
     "baselines",
     "task_language",
     "hypernetwork",

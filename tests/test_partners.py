@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 from toy_game import ToyGame, always
 
-from haland_jax import partners
+from haland_jax import best_responses, partners
 from haland_jax.partners import PartnersConfig, Player, select_seeds
 from haland_jax.ppo import PPOConfig
 
@@ -130,7 +130,7 @@ def test_the_population_holds_the_chosen_pairs(pairs, population):
 
 
 def test_each_ego_is_refitted_against_all_training_partners_of_its_style(game, population):
-    state = partners.best_response_refits(game, CONFIG, jax.random.key(1), population)
+    state = best_responses.best_response_refits(game, CONFIG, jax.random.key(1), population)
     np.testing.assert_array_equal(mark(state.ego.actor), [1, 4, 9, 7])
     for frozen, trained in zip(
         jax.tree.leaves(state.partner), jax.tree.leaves(population.train_partners), strict=True
@@ -139,8 +139,30 @@ def test_each_ego_is_refitted_against_all_training_partners_of_its_style(game, p
         np.testing.assert_array_equal(frozen, np.asarray(trained)[[0, 0, 1, 1]])
 
 
+def test_the_universal_ego_is_refitted_beside_the_own_egos(game, population):
+    told = jax.tree.map(lambda leaf: leaf[:, 0], population.train_egos)
+    told = jax.tree.map(lambda leaf: leaf + 100, told)
+    state = best_responses.best_response_refits(game, CONFIG, jax.random.key(1), population, told)
+    np.testing.assert_array_equal(mark(state.ego.actor), [1, 4, 101, 101, 9, 7, 109, 109])
+    for frozen, trained in zip(
+        jax.tree.leaves(state.partner), jax.tree.leaves(population.train_partners), strict=True
+    ):
+        expected = np.asarray(trained)[[0, 0, 0, 0, 1, 1, 1, 1]]
+        np.testing.assert_array_equal(frozen, expected)
+
+
+def test_each_style_keeps_the_start_that_serves_it_better():
+    egos = Player({"bias": jnp.arange(8.0).reshape(2, 4)}, {"bias": jnp.zeros((2, 4, 3))})
+    returns = np.array([[[5.0, 6.0], [9.0, 1.0]], [[1.0, 1.0], [0.0, 3.0]]])
+    kept, best = best_responses.better_starts(egos, returns)
+    # Means: 5.5 against 5, and 1 against 1.5.
+    np.testing.assert_array_equal(best, [0, 1])
+    np.testing.assert_array_equal(kept.actor["bias"], [[0, 1], [6, 7]])
+    assert kept.critic["bias"].shape == (2, 2, 3)
+
+
 def test_refits_change_the_egos_and_leave_the_partners_alone(game, population):
-    state = partners.best_response_refits(game, CONFIG, jax.random.key(1), population)
+    state = best_responses.best_response_refits(game, CONFIG, jax.random.key(1), population)
     before = jax.tree.map(np.array, (state.ego.actor, state.partner))
     train = partners.compile_training(game, CONFIG.refit, 2)
     state, metrics = train(state, partners.repeat_styles(game, CONFIG.train_seeds))
@@ -161,7 +183,7 @@ def test_the_oracles_candidates_are_the_own_ego_and_archived_ones(game, populati
         jax.tree.map(lambda leaf: leaf + 100, population.train_egos.actor),
         population.train_egos.critic,
     )
-    state = partners.oracle_refits(game, CONFIG, jax.random.key(2), population, archived)
+    state = best_responses.oracle_refits(game, CONFIG, jax.random.key(2), population, archived)
     # [style, held-out partner, candidate]: the own ego, then an archived one, in turn.
     np.testing.assert_array_equal(
         mark(state.ego.actor).reshape(2, 2, 2),

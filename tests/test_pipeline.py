@@ -16,6 +16,7 @@ from refused_command import refused
 from experiments import configs, devices, evaluate, evaluation, generate, run, training
 from experiments.pipeline import run_pipeline
 from experiments.stages import STAGES
+from experiments.stages.best_responses import STARTS
 from haland_jax.universal import VARIANTS
 
 pytestmark = [pytest.mark.slow, pytest.mark.timeout(1500)]
@@ -66,6 +67,9 @@ def test_results_hold_every_method_style_and_held_out_seed(results):
         assert len(results["partners"]["joint_returns"][style]) == config.num_seeds
         curve = np.shape(results["curves"]["returns"][style])
         assert curve == (config.num_seeds, len(results["curves"]["steps"]))
+    starts = results["best_responses"]
+    assert set(starts["starts"]) == set(styles)
+    assert set(starts["starts"].values()) <= set(starts["start_returns"]) == {*STARTS}
     universal = results["universal"]
     assert universal["steps"] == 640
     for variant in VARIANTS:
@@ -209,8 +213,8 @@ def test_a_run_killed_thrice_ends_with_the_results_of_an_uninterrupted_one(
     config = configs.smoke(configs.DEFAULT_ENVIRONMENT, seed=0)
     path = tmp_path / "interrupted"
     run_until_killed(monkeypatch, config, path, "partners/unfinished")
-    run_until_killed(monkeypatch, config, path, "policy_vae/unfinished")
     run_until_killed(monkeypatch, config, path, "universal/unfinished")
+    run_until_killed(monkeypatch, config, path, "policy_vae/unfinished")
     partners_done = (path / "partners" / "metrics.json").stat().st_mtime_ns
     run_pipeline(config, path)
     assert (path / "partners" / "metrics.json").stat().st_mtime_ns == partners_done

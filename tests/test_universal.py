@@ -13,6 +13,7 @@ from envs.base import Pair
 from envs.labelled import Labelled, LabelledStyle
 from experiments import configs, training
 from haland_jax import networks, partners, ppo, rollout, universal
+from haland_jax.partners import Player
 from haland_jax.ppo import PPOConfig, StylesByGame
 from haland_jax.universal import UniversalConfig
 
@@ -169,6 +170,17 @@ def test_a_folded_label_plays_as_the_told_ego():
     )
 
 
+def test_a_folded_label_values_as_the_told_critic():
+    critic = networks.MLPCritic((4, 4))
+    params = critic.init(jax.random.key(0), jnp.zeros(7))
+    seen, label = jnp.array([0.2, -1.0, 0.5]), jnp.array([0.0, 1.0, 0.0, 0.0])
+    np.testing.assert_allclose(
+        critic.apply(universal.fold_label(params, label), seen),
+        critic.apply(params, jnp.append(seen, label)),
+        rtol=1e-5,
+    )
+
+
 def test_partners_that_cannot_share_the_games_are_refused():
     env, config = Labelled(ToyGame()), UniversalConfig(training=TINY)
     with pytest.raises(ValueError, match="is 8; expected a multiple of the 6 training partners"):
@@ -207,11 +219,11 @@ def test_the_told_ego_learns_what_the_other_cannot():
     frozen = frozen_partners([[0], [1]])
     state = universal.init_universal(env, config, jax.random.key(0), frozen)
     state, _ = train(env, config, state, config.training.num_updates)
-    by_style = universal.policies_by_style(env, state.ego.actor)
+    by_style = universal.players_by_style(env, Player(state.ego.actor, state.ego.critic))
     assert tuple(by_style) == universal.VARIANTS
     shares = {}
-    for variant, policies in by_style.items():
-        flat = partners.flatten(policies)
+    for variant, players in by_style.items():
+        flat = partners.flatten(players.actor)
         assert flat["params"]["dense_0"]["kernel"].shape == (2, 3, 64)
         play = partners.compile_evaluation(game, 16)
         games = play(

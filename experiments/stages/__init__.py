@@ -4,16 +4,16 @@ A stage is a function of a `Run` and its progress; it saves its result as a chec
 the matching `load_…` restores, and returns metrics.
 """
 
-from experiments.stages.context import POLICY_STAGES as POLICY_STAGES
+from experiments.stages.best_responses import load_archive as load_archive
+from experiments.stages.best_responses import load_task_language as load_task_language
+from experiments.stages.best_responses import make_best_responses, make_task_language
 from experiments.stages.context import STAGE_NAMES as STAGE_NAMES
 from experiments.stages.context import Run as Run
 from experiments.stages.model import fit_diffusion, fit_policy_vae, fit_translator
 from experiments.stages.model import load_haland as load_haland
 from experiments.stages.model import load_vae as load_vae
-from experiments.stages.population import load_archive as load_archive
 from experiments.stages.population import load_population as load_population
-from experiments.stages.population import load_task_language as load_task_language
-from experiments.stages.population import make_best_responses, make_partners, make_task_language
+from experiments.stages.population import make_partners
 from experiments.stages.universal import load_universal as load_universal
 from experiments.stages.universal import train_universal
 
@@ -22,12 +22,12 @@ STAGES = dict(
         STAGE_NAMES,
         (
             make_partners,
+            train_universal,
             make_best_responses,
             make_task_language,
             fit_policy_vae,
             fit_diffusion,
             fit_translator,
-            train_universal,
         ),
         strict=True,
     )

@@ -13,15 +13,13 @@ from experiments.run_folder import RunFolder
 
 STAGE_NAMES = (
     "partners",
+    "universal",
     "best_responses",
     "task_language",
     "policy_vae",
     "diffusion",
     "translator",
-    "universal",
 )
-POLICY_STAGES = STAGE_NAMES[: STAGE_NAMES.index("universal")]
-"""The stages that turning a sentence into a policy needs."""
 
 
 @dataclasses.dataclass

@@ -9,8 +9,9 @@ import numpy as np
 
 from experiments.errors import as_user_error
 from experiments.progress import StageProgress
+from experiments.stages.best_responses import load_archive, load_task_language
 from experiments.stages.context import Run
-from experiments.stages.population import load_archive, load_population, load_task_language
+from experiments.stages.population import load_population
 from experiments.training import Saver, run_fit
 from haland_jax import (
     bert_weights,

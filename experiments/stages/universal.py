@@ -12,13 +12,13 @@ from experiments.stages.context import Run
 from experiments.stages.population import load_population
 from experiments.training import Saver, train_population
 from haland_jax import checkpoint, universal
-from haland_jax.networks import Policy
+from haland_jax.partners import Player
 
 CURVE_POINTS = 40
 
 
 def train_universal(run: Run, task: StageProgress) -> dict[str, Any]:
-    """Stage 6: trains egos with the training partners of all styles, told the style or not."""
+    """Stage 1b: trains egos with the training partners of all styles, told the style or not."""
     config, env = run.config.universal, Labelled(run.env)
     partners = load_population(run).train_partners
     key = run.key("universal")
@@ -31,7 +31,7 @@ def train_universal(run: Run, task: StageProgress) -> dict[str, Any]:
         task.update,
         "universal egos",
     )
-    checkpoint.save(run.path("universal", "egos"), state.ego.actor)
+    checkpoint.save(run.path("universal", "egos"), Player(state.ego.actor, state.ego.critic))
     points = np.linspace(0, len(returns), min(CURVE_POINTS, len(returns)) + 1).astype(int)
     smooth = np.array([returns[a:b].mean(axis=0) for a, b in itertools.pairwise(points)])
     curves = smooth.reshape(len(smooth), len(universal.VARIANTS), -1)  # [point, variant, seed]
@@ -45,12 +45,13 @@ def train_universal(run: Run, task: StageProgress) -> dict[str, Any]:
     }
 
 
-def load_universal(run: Run) -> dict[str, Policy]:
-    """By variant, the policies for each style, leading axes [style, seed]."""
+def load_universal(run: Run) -> dict[str, Player]:
+    """By variant, the egos as they play with each style, leading axes [style, seed]."""
     config, env = run.config.universal, Labelled(run.env)
     partners = load_population(run).train_partners
     shapes = jax.eval_shape(
         lambda key: universal.init_universal(env, config, key, partners), jax.random.key(0)
     )
-    egos = checkpoint.restore(run.path("universal", "egos"), shapes.ego.actor)
-    return universal.policies_by_style(env, egos)
+    like = Player(shapes.ego.actor, shapes.ego.critic)
+    egos = checkpoint.restore(run.path("universal", "egos"), like)
+    return universal.players_by_style(env, egos)

@@ -1,0 +1,195 @@
+"""Best responses, Oracles and what they do: the data that the method learns from."""
+
+from typing import Any
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+from flax.struct import PyTreeNode
+
+import envs
+from experiments.progress import StageProgress
+from experiments.stages.context import Run
+from experiments.stages.population import load_population, mean_returns
+from experiments.stages.universal import load_universal
+from experiments.training import Saver, train_population
+from haland_jax import best_responses, checkpoint, partners, task_language
+from haland_jax.networks import Policy
+from haland_jax.partners import Player, Population
+from haland_jax.task_language import TaskLanguage
+from haland_jax.universal import TOLD_THE_STYLE
+
+STARTS = ("own ego", "universal ego")
+"""Where the refits of best responses start."""
+
+
+class Archive(PyTreeNode):
+    """Best responses and the Oracles.
+
+    Attributes:
+        egos: refitted egos, leading axes [style, train_seeds].
+        oracles: the best ego for each held-out partner, actors [style, held_out_seeds].
+        oracle_returns: their mean return in selection games, [style, held_out_seeds, candidate].
+    """
+
+    egos: Player
+    oracles: Policy
+    oracle_returns: jax.Array
+
+
+def make_best_responses(run: Run, task: StageProgress) -> dict[str, Any]:
+    """Stage 1c: refits egos, which become the archive, and finds the Oracles."""
+    refit_key, choice_key, oracle_key, play_key = jax.random.split(run.key("best_responses"), 4)
+    population = load_population(run)
+    egos, chosen = _refit_egos(run, refit_key, choice_key, population, task)
+    oracles, returns = _find_oracles(run, oracle_key, play_key, population, egos, task)
+    archive = Archive(egos=egos, oracles=oracles, oracle_returns=jnp.asarray(returns, jnp.float32))
+    checkpoint.save(run.path("best_responses", "archive"), archive)
+    return {**chosen, "oracle_candidate_returns": returns}
+
+
+def _refit_egos(
+    run: Run,
+    refit_key: jax.Array,
+    choice_key: jax.Array,
+    population: Population,
+    task: StageProgress,
+) -> tuple[Player, dict[str, Any]]:
+    """The archive's egos [style, train_seeds], and what each start brought them."""
+    config, env = run.config.partners, run.env
+    told = None
+    if config.universal_start:
+        by_seed = load_universal(run)[TOLD_THE_STYLE]
+        told = jax.tree.map(lambda leaf: leaf[:, 0], by_seed)
+    starts = STARTS if told is not None else STARTS[:1]
+    times = len(starts) * config.train_seeds
+    refitted, _ = train_population(
+        env,
+        config.refit,
+        lambda: best_responses.best_response_refits(env, config, refit_key, population, told),
+        partners.repeat_styles(env, times),
+        Saver(run.path("best_responses", "unfinished_refits")),
+        task.update,
+        "best responses",
+    )
+    num_styles = len(env.style_names)
+    egos = partners.unflatten(Player(refitted.ego.actor, refitted.ego.critic), num_styles)
+
+    each = jax.tree.map(lambda leaf: jnp.repeat(leaf, config.train_seeds, axis=1), egos.actor)
+    everyone = jax.tree.map(
+        lambda leaf: jnp.tile(leaf, (1, times) + (1,) * (leaf.ndim - 2)),
+        population.train_partners,
+    )
+    returns = mean_returns(
+        run,
+        choice_key,
+        partners.flatten(each),
+        partners.flatten(everyone),
+        times * config.train_seeds,
+    ).reshape(num_styles, len(starts), config.train_seeds, config.train_seeds)
+    kept, best = best_responses.better_starts(egos, returns.mean(axis=3))
+    return kept, {
+        "starts": {name: starts[i] for name, i in zip(env.style_names, best, strict=True)},
+        "start_returns": {
+            start: returns.mean(axis=(2, 3))[:, index] for index, start in enumerate(starts)
+        },
+    }
+
+
+def _find_oracles(
+    run: Run,
+    oracle_key: jax.Array,
+    play_key: jax.Array,
+    population: Population,
+    egos: Player,
+    task: StageProgress,
+) -> tuple[Policy, np.ndarray]:
+    """The best ego for each held-out partner [style, seed], and all candidates' returns."""
+    config, env = run.config.partners, run.env
+    num_styles, offset = len(env.style_names), config.refit.num_updates
+    candidates = config.held_out_seeds * config.oracle_candidates
+    trained, _ = train_population(
+        env,
+        config.oracle,
+        lambda: best_responses.oracle_refits(env, config, oracle_key, population, egos),
+        partners.repeat_styles(env, candidates),
+        Saver(run.path("best_responses", "unfinished_oracles")),
+        lambda done, metrics: task.update(offset + done, metrics),
+        "oracles",
+    )
+    repeated = jax.tree.map(
+        lambda leaf: jnp.repeat(leaf, config.oracle_candidates, axis=1),
+        population.held_out_partners,
+    )
+    returns = mean_returns(
+        run, play_key, trained.ego.actor, partners.flatten(repeated), candidates
+    ).reshape(num_styles, config.held_out_seeds, config.oracle_candidates)
+    best = returns.argmax(axis=2)
+    actors = jax.tree.map(
+        lambda leaf: leaf.reshape(*returns.shape, *leaf.shape[1:]), trained.ego.actor
+    )
+    rows, columns = np.indices(best.shape)
+    return jax.tree.map(lambda leaf: leaf[rows, columns, best], actors), returns
+
+
+def load_archive(run: Run) -> Archive:
+    """The best responses and Oracles that `make_best_responses` kept."""
+    config = run.config.partners
+    population = load_population(run)
+    shape = (len(run.env.style_names), config.held_out_seeds, config.oracle_candidates)
+    like = Archive(
+        egos=population.train_egos,
+        oracles=population.held_out_egos.actor,
+        oracle_returns=jnp.zeros(shape),
+    )
+    return checkpoint.restore(run.path("best_responses", "archive"), like)
+
+
+def make_task_language(run: Run, task: StageProgress) -> dict[str, Any]:
+    """Stage 2: what tells the styles apart, as frequencies of events or as labels."""
+    times = run.config.partners.train_seeds
+    if run.env.task_language_source == "labels":
+        language = task_language.build_label_language(len(run.env.style_names), times)
+    else:
+        language = _count_events(run)
+    task.update(1)
+    checkpoint.save(
+        run.path("task_language", "language"),
+        {"v_hat": language.v_hat, "by_seed": language.v_hat_by_seed, "scale": language.scale},
+        {"events": list(language.event_names), "dropped": list(language.dropped_event_names)},
+    )
+    return {"events": len(language.event_names), "dropped": len(language.dropped_event_names)}
+
+
+def _count_events(run: Run) -> TaskLanguage:
+    """Counts events in games of the best responses with their training partners."""
+    env, games = run.env, run.config.task_language_games
+    population, archive = load_population(run), load_archive(run)
+    times = run.config.partners.train_seeds
+    play = partners.compile_evaluation(env, games)
+    keys = jax.random.split(run.key("task_language"), len(env.style_names) * times)
+    played = play(
+        keys,
+        partners.flatten(archive.egos.actor),
+        partners.flatten(population.train_partners),
+        partners.repeat_styles(env, times),
+    )
+    counts = partners.unflatten(played.events, len(env.style_names))
+    lengths = partners.unflatten(played.lengths, len(env.style_names))
+    names = task_language.agent_event_names(env.event_names, envs.AGENTS)
+    return task_language.build_task_language(
+        task_language.event_frequencies(counts, lengths), names
+    )
+
+
+def load_task_language(run: Run) -> TaskLanguage:
+    """What `make_task_language` counted."""
+    path = run.path("task_language", "language")
+    arrays, names = checkpoint.restore(path), checkpoint.read_metadata(path)
+    return TaskLanguage(
+        v_hat=jnp.asarray(arrays["v_hat"]),
+        v_hat_by_seed=jnp.asarray(arrays["by_seed"]),
+        scale=jnp.asarray(arrays["scale"]),
+        event_names=tuple(names["events"]),
+        dropped_event_names=tuple(names["dropped"]),
+    )

@@ -1,0 +1,152 @@
+"""Best responses to styled partners, and the Oracles that they are measured against.
+
+1. Each training ego is refitted against *all* frozen training partners of its style
+   (`best_response_refits`): an ego that knew one partner only keeps that partner's private
+   conventions. The universal ego that is told the style (`haland_jax.universal`) is refitted too:
+   it brings what it learnt with other styles. Of the two starts each style keeps the one whose
+   egos serve its training partners better (`better_starts`). These egos are the archive.
+2. The Oracle of a held-out partner is the best of a few egos of its style refitted to that very
+   partner (`oracle_refits`), chosen on other games than those it is scored on.
+"""
+
+from typing import Any
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+
+from envs.base import Environment
+from haland_jax import ppo
+from haland_jax.networks import Policy
+from haland_jax.partners import PartnersConfig, Player, Population, flatten, repeat_styles
+from haland_jax.population import over_population
+from haland_jax.ppo import PPOConfig, TrainState
+
+
+def init_refits(
+    env: Environment,
+    config: PPOConfig,
+    key: jax.Array,
+    egos: Player,
+    partners: Policy,
+    styles: Any,
+) -> TrainState:
+    """Starts the refit of egos against frozen partners.
+
+    Args:
+        env: the environment.
+        config: settings of the refit.
+        key: consumed.
+        egos: where each refit starts, leading axis [member].
+        partners: frozen actors, leading axes [member, partner]; they share the games.
+        styles: style of each member.
+    """
+
+    def init_refit(key, ego, partners, style):
+        learner = ppo.learner_from(ego.actor, ego.critic, config)
+        return ppo.init_train_state(env, config, key, learner, partners, style)
+
+    keys = jax.random.split(key, jax.tree.leaves(styles)[0].shape[0])
+    return over_population(init_refit)(keys, egos, partners, styles)
+
+
+def best_response_refits(
+    env: Environment,
+    config: PartnersConfig,
+    key: jax.Array,
+    population: Population,
+    universal: Player | None = None,
+) -> TrainState:
+    """Starts the refits that become the archive.
+
+    Args:
+        env: the environment.
+        config: how many.
+        key: consumed.
+        population: the training partners and their egos.
+        universal: the universal ego as it plays with each style, leading axis [style], or None
+            to refit the partners' own egos alone.
+
+    Returns:
+        Training states, leading axis [style * egos]; the egos of a style are those of its
+        training seeds, then as many copies of the universal ego.
+    """
+    egos, times = population.train_egos, config.train_seeds
+    if universal is not None:
+        egos = jax.tree.map(
+            lambda own, other: jnp.concatenate(
+                [own, jnp.repeat(other[:, None], times, axis=1)], axis=1
+            ),
+            egos,
+            universal,
+        )
+        times = 2 * times
+    partners = jax.tree.map(
+        lambda leaf: jnp.repeat(leaf[:, None], times, axis=1), population.train_partners
+    )
+    return init_refits(
+        env, config.refit, key, flatten(egos), flatten(partners), repeat_styles(env, times)
+    )
+
+
+def better_starts(egos: Player, returns: np.ndarray) -> tuple[Player, np.ndarray]:
+    """Keeps, for each style, the start whose refitted egos serve it better on average.
+
+    All egos of a style have the same start, so that they stay alike.
+
+    Args:
+        egos: refitted egos, leading axes [style, start * seed].
+        returns: mean return of each with the style's training partners, [style, start, seed].
+
+    Returns:
+        The kept egos, leading axes [style, seed], and the kept start, int [style].
+    """
+    styles, starts, seeds = returns.shape
+    best = returns.mean(axis=2).argmax(axis=1)
+
+    def keep(leaf: jax.Array) -> jax.Array:
+        by_start = leaf.reshape(styles, starts, seeds, *leaf.shape[2:])
+        return by_start[np.arange(styles), best]
+
+    return jax.tree.map(keep, egos), best
+
+
+def oracle_refits(
+    env: Environment,
+    config: PartnersConfig,
+    key: jax.Array,
+    population: Population,
+    archived: Player,
+) -> TrainState:
+    """Starts the Oracle's candidates, leading axis [style * held_out_seeds * candidates].
+
+    The candidates of a held-out partner are its own ego and archived best responses of its
+    style (in turn), so that no archived ego can beat the Oracle but by chance.
+
+    Args:
+        env: the environment.
+        config: how many candidates.
+        key: consumed.
+        population: the held-out partners and their egos.
+        archived: the refitted egos, leading axes [style, train_seeds].
+    """
+    others = config.oracle_candidates - 1
+    seeds = config.held_out_seeds
+    chosen = (np.arange(seeds)[:, None] + np.arange(others)) % config.train_seeds
+
+    def candidates(own: jax.Array, archive: jax.Array) -> jax.Array:
+        return jnp.concatenate([own[:, :, None], archive[:, chosen]], axis=2)
+
+    egos = jax.tree.map(candidates, population.held_out_egos, archived)
+    partners = jax.tree.map(
+        lambda leaf: jnp.repeat(leaf[:, :, None, None], config.oracle_candidates, axis=2),
+        population.held_out_partners,
+    )
+    return init_refits(
+        env,
+        config.oracle,
+        key,
+        flatten(flatten(egos)),
+        flatten(flatten(partners)),
+        repeat_styles(env, seeds * config.oracle_candidates),
+    )
