@@ -76,8 +76,9 @@ def run_one(environment: str, preset: str, seed: int, out: Path | None) -> None:
     console = Console()
     console.print(summary_table(results))
     console.print(f"Report: {path / 'report.md'}", highlight=False)
+    sentence = load_instructions(environment, results["styles"])[results["styles"][0]].test[0]
     console.print(
-        f'Next: python -m experiments.generate "I stay left …" --run {path} --gif episode.gif',
+        f'Next: python -m experiments.generate "{sentence}" --run {path} --gif episode.gif',
         highlight=False,
     )
 
