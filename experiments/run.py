@@ -15,6 +15,7 @@ from typing import Annotated
 import tyro
 from rich.console import Console
 
+from envs.instructions import load_instructions
 from experiments import devices, run_all
 from experiments.configs import DEFAULT_ENVIRONMENT, PRESETS
 from experiments.errors import UserError, as_user_error, choose, main_guard
