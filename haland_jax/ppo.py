@@ -232,7 +232,7 @@ def _rollout(
         partner = partial(actors.partner.apply, state.partner.actor)
     else:
         partner = partial(_frozen_partners, actors.partner, config.partner_noise, state.partner)
-    play = _over_games(lambda style, *game: env.step(*game, style), style)
+    play = _over_games(lambda style, key, game, actions: env.step(key, game, actions, style), style)
     restart_all = _over_games(_restart(env, random_share), style)
 
     def one_step(carry, step_key):

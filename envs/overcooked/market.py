@@ -112,18 +112,20 @@ def build_market(layout: Layout, style: Style, *, old_dynamics: bool = False) ->
     """
     order = _read_order(layout, np.asarray(style.pays))
     cells, targets, start = (np.asarray(a) for a in (style.cells, style.targets, style.start))
-    walkers = tuple(
+    ego, partner = (
         _build_walker(layout, cells[agent], targets[agent], int(start[agent])) for agent in (0, 1)
     )
     goods = _good_names(layout)
-    trades = tuple(_build_trades(layout, order, walker, goods, old_dynamics) for walker in walkers)
+    of_ego, of_partner = (
+        _build_trades(layout, order, walker, goods, old_dynamics) for walker in (ego, partner)
+    )
     return Market(
         layout=layout,
         order=order,
         good_names=goods,
-        walkers=walkers,
-        trades=trades,
-        following=_following(*walkers),
+        walkers=(ego, partner),
+        trades=(of_ego, of_partner),
+        following=_following(ego, partner),
     )
 
 

@@ -29,6 +29,7 @@ def steady_prices(relaxation: Relaxation, *, endless_turns: bool = False) -> np.
     ]
     pay = np.concatenate([flow[1] for flow in flows])
     goods = np.concatenate([flow[2] for flow in flows]).T
+    places = sum(np.shape(flow[0])[0] for flow in flows)
     balance = sparse.block_diag([flow[0] for flow in flows])
     time = sparse.block_diag([np.ones((1, len(flow[1]))) for flow in flows])
     solved = optimize.linprog(
@@ -36,7 +37,7 @@ def steady_prices(relaxation: Relaxation, *, endless_turns: bool = False) -> np.
         A_ub=sparse.csr_array(-goods),
         b_ub=np.where(endless, 1e6, relaxation.allowance),
         A_eq=sparse.vstack([balance, time]).tocsr(),
-        b_eq=np.concatenate([np.zeros(balance.shape[0]), np.full(2, relaxation.max_steps)]),
+        b_eq=np.concatenate([np.zeros(places), np.full(2, relaxation.max_steps)]),
         method="highs",
     )
     if solved.status != 0:
