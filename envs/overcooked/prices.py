@@ -4,6 +4,8 @@ They are those of a steady market in which the players pass through each other: 
 over flows, whose dual values say what one more of each good would be worth.
 """
 
+from typing import Any
+
 import numpy as np
 from scipy import optimize, sparse
 
@@ -29,15 +31,15 @@ def steady_prices(relaxation: Relaxation, *, endless_turns: bool = False) -> np.
     ]
     pay = np.concatenate([flow[1] for flow in flows])
     goods = np.concatenate([flow[2] for flow in flows]).T
-    places = sum(np.shape(flow[0])[0] for flow in flows)
     balance = sparse.block_diag([flow[0] for flow in flows])
+    rows: Any = balance.shape  # SciPy's stubs allow None.
     time = sparse.block_diag([np.ones((1, len(flow[1]))) for flow in flows])
     solved = optimize.linprog(
         -pay,
         A_ub=sparse.csr_array(-goods),
         b_ub=np.where(endless, 1e6, relaxation.allowance),
         A_eq=sparse.vstack([balance, time]).tocsr(),
-        b_eq=np.concatenate([np.zeros(places), np.full(2, relaxation.max_steps)]),
+        b_eq=np.concatenate([np.zeros(rows[0]), np.full(2, relaxation.max_steps)]),
         method="highs",
     )
     if solved.status != 0:
