@@ -6,6 +6,7 @@ import os
 os.environ.setdefault("TF_CPP_MIN_LOG_LEVEL", "3")
 os.environ.setdefault("TRANSFORMERS_NO_ADVISORY_WARNINGS", "1")
 
+import filelock
 import hypothesis
 import jax
 import pytest
@@ -37,11 +38,16 @@ def pytest_configure(config):
 
 
 @pytest.fixture(scope="session")
-def smoke_run(tmp_path_factory):
-    """The folder of an uninterrupted smoke run; not to be written to."""
+def smoke_run(tmp_path_factory, worker_id):
+    """The folder of an uninterrupted smoke run; made once, not to be written to."""
     from experiments import configs
     from experiments.pipeline import run_pipeline
 
-    path = tmp_path_factory.mktemp("runs") / "smoke"
-    run_pipeline(configs.smoke(configs.DEFAULT_ENVIRONMENT, seed=0), path)
+    folder = tmp_path_factory.getbasetemp()
+    if worker_id != "master":
+        folder = folder.parent  # All workers share it.
+    path = folder / "smoke"
+    with filelock.FileLock(folder / "smoke.lock"):
+        if not (path / "report" / "metrics.json").exists():
+            run_pipeline(configs.smoke(configs.DEFAULT_ENVIRONMENT, seed=0), path)
     return path

@@ -157,7 +157,7 @@ def test_one_flipped_byte_in_a_checkpoint_is_found(capsys, monkeypatch, copied_r
     content[len(content) // 2] ^= 1
     file.write_bytes(content)
     sentence = ("I stay left",) if command is generate else ("--json", "out.json")
-    line = refused(capsys, monkeypatch, command, copied_run, *sentence)
+    line = refused(capsys, monkeypatch, command, "--run", copied_run, *sentence)
     assert "is damaged" in line
     assert file.name in line
     assert not Path("out.json").exists()
