@@ -209,7 +209,7 @@ def test_a_run_killed_thrice_ends_with_the_results_of_an_uninterrupted_one(
     monkeypatch, smoke_run, tmp_path
 ):
     monkeypatch.setattr(training, "SECONDS_BETWEEN_CHECKPOINTS", 0.0)
-    monkeypatch.setattr(training, "UPDATES_PER_PIECE", 3)
+    monkeypatch.setattr(training, "UPDATES_PER_PIECE", 4)
     config = configs.smoke(configs.DEFAULT_ENVIRONMENT, seed=0)
     path = tmp_path / "interrupted"
     run_until_killed(monkeypatch, config, path, "partners/unfinished")
