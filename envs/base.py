@@ -9,6 +9,7 @@ from types import ModuleType
 from typing import Any, Literal, NamedTuple, Protocol
 
 import jax
+import jax.numpy as jnp
 from flax.struct import PyTreeNode
 
 AGENTS = ("ego", "partner")
@@ -39,6 +40,19 @@ class TimeStep(PyTreeNode):
     terminated: jax.Array
     truncated: jax.Array
     events: jax.Array
+
+    @classmethod
+    def first(cls, observation: Pair, num_events: int) -> "TimeStep":
+        """What a reset shows: nothing has been earned, has happened or is over yet."""
+        no = jnp.zeros((), bool)
+        return cls(
+            observation=observation,
+            reward=jnp.zeros(()),
+            shaped_reward=jnp.zeros(2),
+            terminated=no,
+            truncated=no,
+            events=jnp.zeros((2, num_events)),
+        )
 
     @property
     def done(self) -> jax.Array:

@@ -187,15 +187,7 @@ class Overcooked:
         return after, timestep
 
     def _first(self, state: State, style: Style) -> TimeStep:
-        no = jnp.zeros((), bool)
-        return TimeStep(
-            observation=self._observe(state, style),
-            reward=jnp.zeros(()),
-            shaped_reward=jnp.zeros(2),
-            terminated=no,
-            truncated=no,
-            events=jnp.zeros((2, len(self.event_names))),
-        )
+        return TimeStep.first(self._observe(state, style), len(self.event_names))
 
     def _observe(self, state: State, style: Style) -> Pair:
         if self.encoding == "grid":
