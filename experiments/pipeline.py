@@ -7,7 +7,6 @@ from pathlib import Path
 from typing import Any
 
 import jax
-import numpy as np
 
 from experiments import report
 from experiments.configs import RunConfig
@@ -131,8 +130,3 @@ def _totals(config: RunConfig) -> dict[str, int]:
         "translator": translator.fine_tuning.steps + translator.translation.steps,
         "universal": config.universal.training.num_updates,
     }
-
-
-def mean_return(results: dict[str, Any], method: str) -> float:
-    """Mean return of a method over styles and held-out seeds."""
-    return float(np.mean([values["returns"] for values in results["methods"][method].values()]))
