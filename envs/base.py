@@ -106,6 +106,12 @@ class Environment(Protocol):
         ...
 
 
+def check_partner_sight(sight: int | None) -> None:
+    """Raises ValueError unless `sight` is a distance in cells, or None for everywhere."""
+    if sight is not None and sight < 0:
+        raise ValueError(f"partner_sight is {sight}; expected 0 or more, or None")
+
+
 class DrawnEnvironment(Environment, Protocol):
     """An environment that can be drawn: what `envs.make` returns."""
 

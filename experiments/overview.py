@@ -10,12 +10,14 @@ from experiments.summary import (
     BEST_RESPONSE,
     HEADLINE,
     ORACLE,
+    PARTNER_SIGHT,
     UNIVERSAL,
     UNIVERSAL_WITH_LABEL,
     WRONG,
     mean,
     ratios,
     returns,
+    sight_shares,
     summarise,
 )
 from experiments.worth import worth_of_the_style
@@ -45,6 +47,8 @@ class Overview:
         diagonal: return of best responses with partners of their own style.
         off_diagonal: return of best responses with partners of the other styles.
         worth: what knowing the style is worth, in sentences; may be empty.
+        sights: how far the ego of all styles sees the partner, and its shares of the Oracle
+            without and with the style's label; empty where only the full view was measured.
         minutes: all stages together.
         gates_met: how many gates were met.
         gates: how many there are.
@@ -71,6 +75,7 @@ class Overview:
     diagonal: float | None
     off_diagonal: float | None
     worth: str
+    sights: tuple[tuple[str, float, float], ...]
     minutes: float | None
     gates_met: int
     gates: int
@@ -127,6 +132,7 @@ def overview(results: Mapping[str, Any]) -> Overview:
         diagonal=diagonal,
         off_diagonal=off_diagonal,
         worth=worth_of_the_style(results),
+        sights=_sights(results),
         minutes=sum(times.values()) / 60 if times else None,
         gates_met=sum(bool(gate["met"]) for gate in gates.values()),
         gates=len(gates),
@@ -161,6 +167,15 @@ def _upper_bounds(
         return None, None
     bounds = np.asarray([by_style[style] for style in results["styles"]], float)
     return bounds, oracle.mean(axis=1) / bounds if (bounds > 0).all() else None
+
+
+def _sights(results: Mapping[str, Any]) -> tuple[tuple[str, float, float], ...]:
+    if not results.get(PARTNER_SIGHT):
+        return ()
+    return tuple(
+        (seen, mean(by_method[UNIVERSAL]), mean(by_method[UNIVERSAL_WITH_LABEL]))
+        for seen, by_method in sight_shares(results).items()
+    )
 
 
 def _cross_play(results: Mapping[str, Any]) -> tuple[float | None, float | None]:

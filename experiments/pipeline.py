@@ -49,11 +49,12 @@ def run_pipeline(config: RunConfig, path: Path) -> dict[str, Any]:
             with progress.stage(EVALUATION, NUM_METHODS) as task:
                 measured = evaluate(run, task)
             folder.finish_stage(EVALUATION, {**measured, "seconds": time.monotonic() - start})
-        results = collect_results(run)
-        folder.write_json("results.json", results)
         if folder.stage_done(REPORT):
             progress.skip(REPORT)
+            results = folder.read_json("results.json")
         else:
+            results = collect_results(run)
+            folder.write_json("results.json", results)
             with progress.stage(REPORT, len(run.env.style_names)) as task:
                 record_episodes(run, task)
                 report.write_report(results, path)

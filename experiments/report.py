@@ -14,6 +14,7 @@ from experiments.summary import (
     HEADLINE,
     METHODS,
     ORACLE,
+    PARTNER_SIGHT,
     UNIVERSAL,
     UNIVERSAL_WITH_LABEL,
     WRONG,
@@ -23,6 +24,7 @@ from experiments.summary import (
     ordered_methods,
     ratios,
     returns,
+    sight_shares,
     spread,
     summarise,
 )
@@ -219,8 +221,23 @@ def _universal(results: Mapping[str, Any]) -> dict[str, str]:
 
 def _worth(results: Mapping[str, Any], figures: Iterable[Path]) -> str:
     shown = [_shown(file) for file in figures if file.stem == _WORTH_FIGURE]
-    parts = list(filter(None, [worth_of_the_style(results), *shown]))
+    parts = list(filter(None, [worth_of_the_style(results), *shown, _sights(results)]))
     return "\n\n".join(["## What the style is worth", *parts]) if parts else ""
+
+
+def _sights(results: Mapping[str, Any]) -> str:
+    """The same for egos that see the partner only nearby, where that was measured."""
+    if not results.get(PARTNER_SIGHT):
+        return ""
+    rows = [
+        (seen, *(f"{mean(by_method[method]):.3f}" for method in COMPARISONS))
+        for seen, by_method in sight_shares(results).items()
+    ]
+    table = _table(("ego sees the partner", *COMPARISONS), rows, "lrr")
+    return (
+        f"{table}\n\nShare of the Oracle, which sees the partner everywhere. Partners and kitchen "
+        "are the same;\nonly the ego's view of the partner ends at that many rows and columns."
+    )
 
 
 def _translator(results: Mapping[str, Any]) -> str:

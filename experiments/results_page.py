@@ -127,6 +127,7 @@ def page(overviews: Sequence[Overview], remarks: str) -> str:
         "A wide gap between *own style* and *other styles* means that an ego must know its "
         "partner's style. Where the *universal ego* comes near *own style*, it can see the style "
         "for itself, and a sentence has little to add; where being *told* helps it, it cannot.",
+        _sights(overviews),
         "## How it was measured\n\n" + _table(overviews, _HOW),
         "To make the same runs, and this page from them:\n\n```bash\n"
         + "\n".join(_commands(overviews))
@@ -157,6 +158,25 @@ def short_table(overviews: Sequence[Overview], folder: str) -> str:
         f"{_verdict(overviews)} Preset {', '.join(presets)}; [what the columns mean, all "
         f"environments in detail, and how to make them again]({folder}/README.md).\n\n"
         + _table(overviews, columns)
+    )
+
+
+def _sights(overviews: Sequence[Overview]) -> str:
+    """What the style is worth to egos that see the partner only nearby; empty if unmeasured."""
+    rows = [
+        (row.environment, seen, f"{untold:.2f}", f"{told:.2f}", f"{told - untold:+.2f}")
+        for row in overviews
+        for seen, untold, told in row.sights
+    ]
+    if not rows:
+        return ""
+    head = ("environment", "ego sees the partner", "universal ego", "told", "worth of the label")
+    return (
+        "### When the partner can be seen only nearby\n\nShares of the Oracle, which sees the "
+        "partner everywhere. Kitchen, styles and partners are the same; the ego's view of the "
+        "partner ends at that many rows and columns (`partner_sight` of `envs.make`), and the "
+        "universal egos are trained anew (`python -m experiments.sight RUN`).\n\n"
+        + table(head, rows, "llrrr")
     )
 
 

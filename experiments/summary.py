@@ -31,6 +31,8 @@ METHODS = (
 """The method itself, step by step."""
 COMPARISONS = (UNIVERSAL, UNIVERSAL_WITH_LABEL)
 """What else every run measures."""
+PARTNER_SIGHT = "partner_sight"
+"""Where results.json has the comparisons with egos that see the partner only nearby."""
 
 
 @dataclasses.dataclass(frozen=True)
@@ -95,6 +97,20 @@ def ratios(results: Mapping[str, Any], method: str) -> np.ndarray:
             f"{oracle.shape[1]}"
         )
     return shares(measured, oracle)
+
+
+def sight_shares(results: Mapping[str, Any]) -> dict[str, dict[str, np.ndarray]]:
+    """The comparisons' shares of the Oracle by how far the ego sees the partner.
+
+    Returns:
+        By "everywhere", "2 cells" and so on, by method: `ratios`, [style, seed].
+    """
+    found = {"everywhere": {method: ratios(results, method) for method in COMPARISONS}}
+    for measured in results.get(PARTNER_SIGHT, []):
+        seen = f"{measured['cells']} cell{'s' * (measured['cells'] != 1)} away"
+        nearby = {**results, "methods": measured["methods"]}
+        found[seen] = {method: ratios(nearby, method) for method in COMPARISONS}
+    return found
 
 
 def shares(returns: np.ndarray, oracle: np.ndarray) -> np.ndarray:

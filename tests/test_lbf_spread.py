@@ -178,6 +178,21 @@ def test_limited_sight_hides_what_is_far():
     np.testing.assert_array_equal(FEATURES(env.rules, moved)[0], ego)
 
 
+def test_only_the_egos_view_of_the_partner_ends_at_partner_sight():
+    near, far = (drawn_state(spread.PLACES, ego=(4, 4), partner=(row, 4)) for row in (6, 7))
+    rules = envs.make("lbf/spread").rules
+    names = features.feature_slices(8)
+    seen = jax.jit(lambda state: features.features(rules, state, 2))
+    np.testing.assert_array_equal(seen(near), FEATURES(rules, near))
+    ego, partner = np.asarray(seen(far))
+    full_ego, full_partner = np.array(FEATURES(rules, far))
+    np.testing.assert_array_equal(partner, full_partner)
+    assert full_ego[names["other_seen"]] == full_ego[names["other_beside"]].sum() == 1
+    for name in ("other_away", "other_side", "other_seen", "other_steps", "other_beside"):
+        full_ego[names[name]] = 0
+    np.testing.assert_array_equal(ego, full_ego)
+
+
 def test_events_name_the_food_and_the_place(env, step):
     places = np.roll(spread.PLACES, 1, axis=0)  # level 1 at the south east, level 2 north west
     state = drawn_state(places, ego=(0, 1), partner=(1, 0))
@@ -289,6 +304,11 @@ def test_the_scripted_pair_wins_every_game_of_every_style(env):
         (lambda: envs.make("lbf/spread", max_steps=20.5), "max_steps is 20.5"),
         (lambda: envs.make("lbf/spread", sight=0), "sight is 0"),
         (lambda: envs.make("lbf/spread", sight="far"), "sight is 'far'"),
+        (lambda: envs.make("lbf/spread", partner_sight=-1), "partner_sight is -1"),
+        (
+            lambda: envs.make("lbf/spread", partner_sight=2, encoding="flat"),
+            "partner_sight is 2 with encoding 'flat'",
+        ),
         (lambda: envs.make("lbf/spread").style("level_9"), "unknown style 'level_9'"),
     ],
 )

@@ -215,3 +215,37 @@ def test_the_environment_shows_both_encodings():
         _, first = env.reset(jax.random.key(0), env.style("free"))
         shape = (5, 4, 26) if encoding == "grid" else (env.observation_sizes.ego,)
         assert first.observation.ego.shape == first.observation.partner.shape == shape
+
+
+@pytest.mark.parametrize("encoding", ["features", "grid"])
+def test_out_of_sight_the_partner_is_in_no_slice_and_the_rest_stays(encoding):
+    layout = layouts.load_layout("counter_circuit")
+    states = random_states(layout, 60)
+    kitchen = {"max_steps": MAX_STEPS, "encoding": encoding}
+    everywhere = envs.make("overcooked/counter_circuit", **kitchen)
+    nearby = envs.make("overcooked/counter_circuit", partner_sight=1, **kitchen)
+    style = everywhere.style("free")
+    full, near = (
+        jax.vmap(env._observe, in_axes=(0, None))(states, style) for env in (everywhere, nearby)
+    )
+    # The partner's own view stays as it is.
+    np.testing.assert_array_equal(near.partner, full.partner)
+    place = layout.floor[np.asarray(states.cell)]
+    hidden = np.abs(place[:, 0] - place[:, 1]).max(axis=1) > 1
+    assert 5 < hidden.sum() < 55
+    np.testing.assert_array_equal(near.ego[~hidden], full.ego[~hidden])
+    seen, expected = np.asarray(near.ego)[hidden], np.array(full.ego)[hidden]
+    if encoding == "features":
+        for name in ("other_cell", "other_orientation", "other_held"):
+            expected[:, observation.feature_slices(layout)[name]] = 0
+    else:
+        for index, (x, y) in enumerate(place[hidden, 1]):
+            # Nothing but players and what they hold is on a floor cell.
+            assert expected[index, x, y, observation.GRID_CHANNELS.index("other_location")]
+            expected[index, x, y, : observation.GRID_CHANNELS.index("urgency")] = 0
+    np.testing.assert_array_equal(seen, expected)
+
+
+def test_a_sight_of_less_than_nothing_is_refused():
+    with pytest.raises(ValueError, match="partner_sight is -1; expected 0 or more, or None"):
+        envs.make("overcooked/center_pots", partner_sight=-1)

@@ -13,7 +13,7 @@ import pytest
 from PIL import Image
 from refused_command import refused
 
-from experiments import configs, devices, evaluate, evaluation, generate, run, training
+from experiments import configs, devices, evaluate, evaluation, generate, run, sight, training
 from experiments.pipeline import run_pipeline
 from experiments.stages import STAGES
 from experiments.stages.best_responses import STARTS
@@ -134,6 +134,31 @@ def in_this_process(monkeypatch, tmp_path):
 def copied_run(smoke_run, tmp_path):
     """A copy of the smoke run that a test may damage."""
     return Path(shutil.copytree(smoke_run, tmp_path / "copy"))
+
+
+def test_sight_adds_egos_that_see_the_partner_nearby(monkeypatch, capsys, copied_run, results):
+    run_command(monkeypatch, sight, copied_run, "--cells", 1)
+    assert "1 cell away" in capsys.readouterr().out
+    found = json.loads((copied_run / "results.json").read_text())
+    (measured,) = found.pop("partner_sight")
+    assert found == results
+    assert measured["cells"] == 1
+    assert set(measured["methods"]) == set(evaluation.COMPARISONS)
+    assert all(
+        np.shape(by_style["left_no_onion"]["returns"]) == (1,)
+        for by_style in measured["methods"].values()
+    )
+    assert "| 1 cell away |" in (copied_run / "report.md").read_text()
+    # Neither the same command nor the run's own makes or loses any of it.
+    made = (copied_run / "results.json").read_bytes()
+    run_command(monkeypatch, sight, copied_run, "--cells", 1)
+    run_command(monkeypatch, run, "--preset", "smoke", "--out", copied_run)
+    assert (copied_run / "results.json").read_bytes() == made
+
+
+def test_sight_refuses_what_is_no_distance(capsys, monkeypatch, smoke_run):
+    line = refused(capsys, monkeypatch, sight, smoke_run, "--cells", 2, -1)
+    assert "cells is -1; expected numbers from 0 up" in line
 
 
 def test_a_sentence_must_hold_words_and_not_too_many(capsys, monkeypatch, smoke_run):

@@ -100,6 +100,18 @@ def test_the_pages_numbers_are_those_worked_out_by_hand():
     assert "earns 80.0% of the Oracle; it reaches the aim of 95% in 0 of 1 environments" in page
 
 
+def test_a_view_that_ends_nearby_has_its_row_beside_the_full_one():
+    results = small_results()
+    told = results["methods"]["Universal ego with the style's label"]
+    untold = {"left": {"returns": [25.0, 50.0]}, "right": {"returns": [25.0, 20.0]}}
+    methods = {"Universal ego": untold, "Universal ego with the style's label": told}
+    results["partner_sight"] = [{"cells": 1, "steps": 100, "methods": methods}]
+    full, nearby = rows_of(results_page.page([overview(results)], ""))[2:4]
+    # (50/100 + 50/200 + 30/100 + 30/80) / 4 and (60/100 + 60/200 + 50/100 + 50/80) / 4
+    assert list(full.values())[1:] == ["everywhere", "0.36", "0.51", "+0.15"]
+    assert list(nearby.values())[1:] == ["1 cell away", "0.25", "0.51", "+0.26"]
+
+
 def test_what_was_not_measured_is_a_dash():
     results = without(small_results(), "upper_bounds", "cross_play", "translator", "machine")
     results["methods"] = {"Best response": results["methods"]["Best response"]}

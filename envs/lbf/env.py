@@ -8,7 +8,7 @@ from typing import Any, ClassVar, Literal
 import jax
 import jax.numpy as jnp
 
-from envs.base import Pair, TimeStep
+from envs.base import Pair, TimeStep, check_partner_sight
 from envs.lbf import dynamics, events, features, observation, reward, spread, styles
 from envs.lbf.dynamics import Rules, State
 from envs.lbf.reward import ShapingWeights
@@ -26,12 +26,15 @@ class Spread:
         sight: cells that a player sees in each direction; None sees the whole field.
         encoding: `features`, a vector for small MLPs; `flat`, lbforaging's vector; or `grid`,
             lbforaging's layers, to which the partner's adds one that marks the target.
+        partner_sight: rows and columns up to which the ego sees the partner, with `features`
+            only; None sees it as far as `sight` goes.
         weights: worth of the shaped reward's terms.
     """
 
     max_steps: int = 50
     sight: int | None = None
     encoding: Literal["features", "grid", "flat"] = "features"
+    partner_sight: int | None = None
     weights: ShapingWeights = dataclasses.field(default_factory=ShapingWeights)
     name: ClassVar[str] = "lbf/spread"
     rows: ClassVar[int] = spread.SIZE
@@ -42,6 +45,12 @@ class Spread:
         if self.encoding not in ENCODINGS:
             raise ValueError(
                 f"encoding is {self.encoding!r}; expected one of {', '.join(ENCODINGS)}"
+            )
+        check_partner_sight(self.partner_sight)
+        if self.partner_sight is not None and self.encoding != "features":
+            raise ValueError(
+                f"partner_sight is {self.partner_sight} with encoding {self.encoding!r}; expected "
+                "encoding 'features', or no partner_sight"
             )
         if self.rules.max_steps < spread.LEAST_TIME_LEFT:
             raise ValueError(
@@ -184,7 +193,7 @@ class Spread:
         if self.encoding == "flat":
             ego, partner = observation.flat(self.rules, state).astype(jnp.float32)
         else:
-            ego, partner = features.features(self.rules, state)
+            ego, partner = features.features(self.rules, state, self.partner_sight)
         return Pair(ego, jnp.concatenate([partner, style.task]))
 
     @staticmethod

@@ -47,17 +47,25 @@ def num_features(num_foods: int) -> int:
     return feature_slices(num_foods)["time_left"].stop
 
 
-def features(rules: Rules, state: State) -> jax.Array:
-    """Returns both players' feature vectors, float32 [2, O]; slices in `feature_slices`."""
+def features(rules: Rules, state: State, partner_sight: int | None = None) -> jax.Array:
+    """Returns both players' feature vectors, float32 [2, O]; slices in `feature_slices`.
+
+    Args:
+        rules: of the game.
+        state: the state.
+        partner_sight: rows and columns up to which the first player sees the second, where
+            that is nearer than the rules' sight.
+    """
     size = np.array([rules.rows - 1, rules.columns - 1], np.float32)
     south, east = dynamics.offsets(state)
     seen = observation.foods_in_sight(rules, state)
     beside = dynamics.beside(state)
     steps = jnp.maximum(jnp.abs(south) + jnp.abs(east) - 1, 0) / size.sum()
     other_away = state.place[::-1] - state.place
-    other_seen = jnp.ones(2, bool)
-    if rules.sight is not None:
-        other_seen = jnp.all(jnp.abs(other_away) <= rules.sight, axis=1)
+    everywhere = max(rules.rows, rules.columns)
+    sight = everywhere if rules.sight is None else rules.sight
+    nearer = sight if partner_sight is None else min(partner_sight, sight)
+    other_seen = jnp.all(jnp.abs(other_away) <= np.array([[nearer], [sight]]), axis=1)
     other_away = jnp.where(other_seen[:, None], other_away, 0)
     both_seen = seen & other_seen[:, None]
     other_beside = both_seen & beside[::-1]

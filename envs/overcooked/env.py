@@ -8,7 +8,7 @@ from typing import ClassVar, Literal
 import jax
 import jax.numpy as jnp
 
-from envs.base import Pair, TimeStep
+from envs.base import Pair, TimeStep, check_partner_sight
 from envs.overcooked import dynamics, events, layouts, moments, observation, reward, styles
 from envs.overcooked.dynamics import State, Transition
 from envs.overcooked.layouts import Layout
@@ -27,6 +27,8 @@ class Overcooked:
             by itself, and only so.
         encoding: `features`, a flat vector, or `grid`, overcooked-ai's lossless encoding.
         shaping: `guided`, ours, or `reference`, overcooked-ai's.
+        partner_sight: columns and rows up to which the ego sees the partner; None sees it
+            everywhere.
     """
 
     layout: Layout
@@ -34,6 +36,7 @@ class Overcooked:
     dynamics: Literal["new", "old"] = "new"
     encoding: Literal["features", "grid"] = "features"
     shaping: Literal["guided", "reference"] = "guided"
+    partner_sight: int | None = None
     weights: ShapingWeights = dataclasses.field(default_factory=ShapingWeights)
     task_language_source: ClassVar[Literal["events", "labels"]] = "events"
 
@@ -46,6 +49,7 @@ class Overcooked:
             value = getattr(self, name)
             if value not in options:
                 raise ValueError(f"{name} is {value!r}; expected one of {', '.join(options)}")
+        check_partner_sight(self.partner_sight)
         if self.max_steps <= 50:
             raise ValueError(f"max_steps is {self.max_steps}; expected more than 50")
 
@@ -190,13 +194,13 @@ class Overcooked:
         return TimeStep.first(self._observe(state, style), len(self.event_names))
 
     def _observe(self, state: State, style: Style) -> Pair:
-        if self.encoding == "grid":
-            return Pair(
-                *(observation.grid(self.layout, state, agent, self.max_steps) for agent in (0, 1))
-            )
+        observe = observation.grid if self.encoding == "grid" else observation.features
         ego, partner = (
-            observation.features(self.layout, state, agent, self.max_steps) for agent in (0, 1)
+            observe(self.layout, state, agent, self.max_steps, sight)
+            for agent, sight in ((0, self.partner_sight), (1, None))
         )
+        if self.encoding == "grid":
+            return Pair(ego, partner)
         return Pair(ego, jnp.concatenate([partner, style.task]))
 
     def _shaped_reward(self, transition: Transition, style: Style) -> jax.Array:

@@ -64,9 +64,29 @@ def _item_table(layout: Layout) -> np.ndarray:
     return table if layout.has_tomatoes else table[:, [0, 2, 3, 4]]
 
 
-def features(layout: Layout, state: State, agent: int, max_steps: int) -> jax.Array:
-    """Returns one player's feature vector, float32 [O]; slices in `feature_slices`."""
+def in_sight(layout: Layout, state: State, sight: int | None) -> jax.Array:
+    """Returns whether the players are at most `sight` columns and rows apart, bool []."""
+    if sight is None:
+        return jnp.ones((), bool)
+    away = np.abs(layout.floor[:, None] - layout.floor).max(axis=-1)
+    return jnp.asarray(away <= sight)[state.cell[0], state.cell[1]]
+
+
+def features(
+    layout: Layout, state: State, agent: int, max_steps: int, sight: int | None = None
+) -> jax.Array:
+    """Returns one player's feature vector, float32 [O]; slices in `feature_slices`.
+
+    Args:
+        layout: the kitchen.
+        state: the state.
+        agent: who sees it.
+        max_steps: steps of a game.
+        sight: columns and rows up to which it sees the other player, whose slices (`other_…`)
+            are 0 farther away; None sees it everywhere.
+    """
     other = 1 - agent
+    seen = in_sight(layout, state, sight)
     cell_codes, directions = np.arange(len(layout.floor)), np.arange(4)
     item = jnp.asarray(_item_table(layout))
     station = dynamics.faced_station(layout, state, agent)
@@ -93,11 +113,11 @@ def features(layout: Layout, state: State, agent: int, max_steps: int) -> jax.Ar
     )
     parts = (
         state.cell[agent] == cell_codes,
-        state.cell[other] == cell_codes,
+        (state.cell[other] == cell_codes) & seen,
         state.orientation[agent] == directions,
-        state.orientation[other] == directions,
+        (state.orientation[other] == directions) & seen,
         item[state.held[agent]],
-        item[state.held[other]],
+        item[jnp.where(seen, state.held[other], 0)],
         jnp.asarray(layout.kinds)[station] == np.arange(7),
         item[faced_item],
         jnp.any(at_pot & ready)[None],
@@ -174,21 +194,25 @@ def _kitchen_rows(layout: Layout, state: State) -> jax.Array:
     return jnp.concatenate([*pieces, terrain[end:]])
 
 
-def grid(layout: Layout, state: State, agent: int, max_steps: int) -> jax.Array:
+def grid(
+    layout: Layout, state: State, agent: int, max_steps: int, sight: int | None = None
+) -> jax.Array:
     """Returns overcooked-ai's lossless grid encoding for one player, uint8 [W, H, 26].
 
     Channels are named by `GRID_CHANNELS`; axes are (x, y) as in the reference, whose
-    `lossless_state_encoding` of version 1.1.0 this follows.
+    `lossless_state_encoding` of version 1.1.0 this follows. Arguments as for `features`; a
+    player out of sight is in no channel.
     """
     channels = np.arange(len(GRID_CHANNELS))
     encoded = _kitchen_rows(layout, state)
     places = np.arange(layout.width * layout.height)
     floor = jnp.asarray(layout.floor @ np.array([layout.height, 1]))
-    for player, location, orientation in (
-        (agent, "own_location", "own_orientation_north"),
-        (1 - agent, "other_location", "other_orientation_north"),
+    seen = in_sight(layout, state, sight)
+    for player, shown, location, orientation in (
+        (agent, True, "own_location", "own_orientation_north"),
+        (1 - agent, seen, "other_location", "other_orientation_north"),
     ):
-        here = places == floor[state.cell[player]]
+        here = (places == floor[state.cell[player]]) & shown
         row = (
             jnp.asarray(_item_rows())[state.held[player]]
             | (channels == _CHANNEL[location])

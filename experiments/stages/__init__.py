@@ -15,7 +15,9 @@ from experiments.stages.model import load_vae as load_vae
 from experiments.stages.population import load_population as load_population
 from experiments.stages.population import make_partners
 from experiments.stages.universal import load_universal as load_universal
+from experiments.stages.universal import load_universal_in as load_universal_in
 from experiments.stages.universal import train_universal
+from experiments.stages.universal import train_universal_in as train_universal_in
 
 STAGES = dict(
     zip(

@@ -6,6 +6,7 @@ from typing import Any
 import jax
 import numpy as np
 
+from envs.base import Environment
 from envs.labelled import Labelled
 from experiments.progress import StageProgress
 from experiments.stages.context import Run
@@ -15,23 +16,38 @@ from haland_jax import checkpoint, universal
 from haland_jax.partners import Player
 
 CURVE_POINTS = 40
+STAGE = "universal"
 
 
 def train_universal(run: Run, task: StageProgress) -> dict[str, Any]:
     """Stage 1b: trains egos with the training partners of all styles, told the style or not."""
-    config, env = run.config.universal, Labelled(run.env)
+    return train_universal_in(run, run.env, STAGE, task)
+
+
+def train_universal_in(
+    run: Run, game: Environment, stage: str, task: StageProgress
+) -> dict[str, Any]:
+    """Trains such egos in a variant of the run's environment.
+
+    Args:
+        run: whose training partners they learn with.
+        game: the variant; it differs in what the ego sees at most.
+        stage: folder of the run that keeps the egos.
+        task: the progress.
+    """
+    config, env = run.config.universal, Labelled(game)
     partners = load_population(run).train_partners
-    key = run.key("universal")
+    key = run.key(STAGE)
     state, returns = train_population(
         env,
         config.training,
         lambda: universal.init_universal(env, config, key, partners),
         universal.member_styles(env, config.seeds),
-        Saver(run.path("universal", "unfinished")),
+        Saver(run.path(stage, "unfinished")),
         task.update,
         "universal egos",
     )
-    checkpoint.save(run.path("universal", "egos"), Player(state.ego.actor, state.ego.critic))
+    checkpoint.save(run.path(stage, "egos"), Player(state.ego.actor, state.ego.critic))
     points = np.linspace(0, len(returns), min(CURVE_POINTS, len(returns)) + 1).astype(int)
     smooth = np.array([returns[a:b].mean(axis=0) for a, b in itertools.pairwise(points)])
     curves = smooth.reshape(len(smooth), len(universal.VARIANTS), -1)  # [point, variant, seed]
@@ -47,11 +63,16 @@ def train_universal(run: Run, task: StageProgress) -> dict[str, Any]:
 
 def load_universal(run: Run) -> dict[str, Player]:
     """By variant, the egos as they play with each style, leading axes [style, seed]."""
-    config, env = run.config.universal, Labelled(run.env)
+    return load_universal_in(run, run.env, STAGE)
+
+
+def load_universal_in(run: Run, game: Environment, stage: str) -> dict[str, Player]:
+    """The same for the egos of `train_universal_in`."""
+    config, env = run.config.universal, Labelled(game)
     partners = load_population(run).train_partners
     shapes = jax.eval_shape(
         lambda key: universal.init_universal(env, config, key, partners), jax.random.key(0)
     )
     like = Player(shapes.ego.actor, shapes.ego.critic)
-    egos = checkpoint.restore(run.path("universal", "egos"), like)
+    egos = checkpoint.restore(run.path(stage, "egos"), like)
     return universal.players_by_style(env, egos)
