@@ -8,14 +8,12 @@
 Absolute figures drift with the machine's load; ratios of one run hold.
 """
 
-import contextlib
 import dataclasses
 import functools
 import importlib.metadata
 import importlib.util
 import json
 import os
-import platform
 import time
 from pathlib import Path
 from typing import Annotated, Any
@@ -31,6 +29,7 @@ from experiments import benchmark_lbf, contenders, contenders_lbf, devices
 from experiments.configs import DEFAULT_ENVIRONMENT, PRESETS
 from experiments.contenders import PEER, PEER_PLAIN
 from experiments.errors import UserError, choose, main_guard
+from experiments.machine import describe_machine
 
 KITCHENS = ("cramped_room", "counter_circuit")
 BARS = {"features": 5.0, "grid": 2.0}
@@ -195,18 +194,13 @@ def measure_ppo(environment: str, updates: int, repeats: int, config: Any = None
 
 
 def machine() -> dict[str, Any]:
-    """What the figures were measured on."""
-    processor = platform.processor() or platform.machine()
-    with contextlib.suppress(OSError):
-        lines = Path("/proc/cpuinfo").read_text().splitlines()
-        names = [line.split(":", 1)[1].strip() for line in lines if line.startswith("model name")]
-        processor = names[0] if names else processor
+    """What the figures were measured on, peers included."""
+    described = describe_machine()
     peers = (("jaxmarl", contenders), ("jumanji", contenders_lbf))
-    packages = ("jax", "jaxlib", *(name for name, module in peers if module.has_peer()))
+    packages = ("jaxlib", *(name for name, module in peers if module.has_peer()))
     return {
-        "processor": processor,
+        **described,
         "devices": f"{len(jax.devices())} x {jax.devices()[0].device_kind}",
-        "python": platform.python_version(),
         **{name: importlib.metadata.version(name) for name in packages},
     }
 

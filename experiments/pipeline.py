@@ -1,17 +1,14 @@
 """The stages in order; each reads and writes artefacts, and a finished one is not run again."""
 
-import os
-import platform
 import time
 from pathlib import Path
 from typing import Any
-
-import jax
 
 from experiments import report
 from experiments.configs import RunConfig
 from experiments.evaluation import evaluate
 from experiments.gallery import record_episodes
+from experiments.machine import describe_machine
 from experiments.progress import RunProgress
 from experiments.run_folder import RunFolder
 from experiments.stages import STAGES, Run
@@ -100,23 +97,6 @@ def _universal(run: Run, measured: dict[str, Any]) -> dict[str, Any]:
     refits *= config.refit.num_updates * config.refit.steps_per_update
     kept = ("steps", "seeds", "curve_steps", "curve_returns")
     return {**{name: measured[name] for name in kept}, "best_response_steps": pairs + refits}
-
-
-def describe_machine() -> dict[str, Any]:
-    """What the numbers were measured on."""
-    model = platform.processor()
-    cpuinfo = Path("/proc/cpuinfo")
-    if cpuinfo.exists():
-        names = [line for line in cpuinfo.read_text().splitlines() if line.startswith("model name")]
-        model = names[0].split(":", 1)[1].strip() if names else model
-    return {
-        "processor": model,
-        "cores": os.cpu_count(),
-        "devices": [str(device) for device in jax.devices()],
-        "python": platform.python_version(),
-        "jax": jax.__version__,
-        "date": time.strftime("%Y-%m-%d"),
-    }
 
 
 def _totals(config: RunConfig) -> dict[str, int]:
