@@ -5,7 +5,7 @@ from collections.abc import Callable
 
 from haland_jax.diffusion import DiffusionConfig
 from haland_jax.fit import FitConfig
-from haland_jax.partners import PartnersConfig, refit_config
+from haland_jax.partners import PartnersConfig, best_response_config, oracle_config
 from haland_jax.policy_vae import PolicyVAEConfig
 from haland_jax.ppo import PPOConfig
 from haland_jax.translator import TranslatorConfig
@@ -192,8 +192,8 @@ def quick(environment: str, seed: int) -> RunConfig:
             held_out_seeds=2,
             spare_seeds=1,
             joint=PPOConfig(total_steps=900_000),
-            refit=refit_config(400_000, num_envs=36, partner_noise=0.1),
-            oracle=refit_config(200_000),
+            refit=best_response_config(400_000, num_envs=36),
+            oracle=oracle_config(200_000),
             oracle_candidates=2,
             universal_start=False,
         ),
@@ -221,8 +221,8 @@ def overnight(environment: str, seed: int) -> RunConfig:
             held_out_seeds=3,
             spare_seeds=2,
             joint=PPOConfig(total_steps=1_200_000),
-            refit=refit_config(600_000, num_envs=36, partner_noise=0.1),
-            oracle=refit_config(200_000),
+            refit=best_response_config(900_000, num_envs=36),
+            oracle=oracle_config(200_000),
             oracle_candidates=2,
         ),
         compression=CompressionConfig(

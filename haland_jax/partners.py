@@ -24,24 +24,40 @@ from haland_jax.population import over_population
 from haland_jax.ppo import PPOConfig, TrainState
 
 
-def refit_config(total_steps: int, num_envs: int = 32, partner_noise: float = 0.0) -> PPOConfig:
-    """Returns settings for an ego that has learnt already: no shaping, little exploration.
+def best_response_config(total_steps: int, num_envs: int = 32) -> PPOConfig:
+    """Returns settings for an ego that has learnt already and meets further partners: no shaping.
+
+    Most games start at random moments: so the ego meets more than the conventions that the
+    partners it trains with have in common.
 
     Args:
         total_steps: environment steps of one ego.
         num_envs: games in parallel; a multiple of the partners that share them.
-        partner_noise: see `PPOConfig`.
     """
     return PPOConfig(
         total_steps=total_steps,
         num_envs=num_envs,
+        entropy=0.01,
+        shaping=0.0,
+        confined_until=0.0,
+        final_random_start=0.6,
+    )
+
+
+def oracle_config(total_steps: int) -> PPOConfig:
+    """Returns settings for an ego that is fitted to one partner: gentle, mostly from the start.
+
+    Args:
+        total_steps: environment steps of one ego.
+    """
+    return PPOConfig(
+        total_steps=total_steps,
         learning_rate=3e-4,
         entropy=0.01,
         shaping=0.0,
         confined_until=0.0,
         random_start=0.3,
         final_random_start=0.3,
-        partner_noise=partner_noise,
     )
 
 
@@ -66,9 +82,9 @@ class PartnersConfig:
     spare_seeds: int = 2
     joint: PPOConfig = dataclasses.field(default_factory=PPOConfig)
     refit: PPOConfig = dataclasses.field(
-        default_factory=lambda: refit_config(300_000, num_envs=40, partner_noise=0.1)
+        default_factory=lambda: best_response_config(900_000, num_envs=40)
     )
-    oracle: PPOConfig = dataclasses.field(default_factory=lambda: refit_config(300_000))
+    oracle: PPOConfig = dataclasses.field(default_factory=lambda: oracle_config(300_000))
     oracle_candidates: int = 3
     universal_start: bool = True
     evaluation_games: int = 32

@@ -171,7 +171,7 @@ def _update(
         batch = _make_batch(
             config, critic, learner, steps, state.observations[agent], agent, scaled[agent]
         )
-        strided = isinstance(style, StylesByGame)
+        strided = isinstance(style, StylesByGame) or not isinstance(state.partner, Learner)
         learner, loss = _learn(config, actor, critic, learner, batch, strided=strided, **rates)
         state = state.replace(**{role: learner})
         losses.append(loss)
@@ -231,7 +231,7 @@ def _rollout(
     if isinstance(state.partner, Learner):
         partner = partial(actors.partner.apply, state.partner.actor)
     else:
-        partner = partial(_frozen_partners, actors.partner, config.partner_noise, state.partner)
+        partner = partial(_frozen_partners, actors.partner, state.partner)
     play = _over_games(lambda style, key, game, actions: env.step(key, game, actions, style), style)
     restart_all = _over_games(_restart(env, random_share), style)
 
@@ -272,15 +272,12 @@ def _rollout(
     return state.replace(env_states=env_states, observations=observations), steps
 
 
-def _frozen_partners(
-    actor: MLPActor, noise: float, policies: Policy, observation: jax.Array
-) -> Any:
-    """Each of the frozen partners plays an equal share of the games, with trembling hands."""
+def _frozen_partners(actor: MLPActor, policies: Policy, observation: jax.Array) -> Any:
+    """Each of the frozen partners plays an equal share of the games."""
     num_partners = jax.tree.leaves(policies)[0].shape[0]
     shared = observation.reshape(num_partners, -1, observation.shape[-1])
     distributions: Any = jax.vmap(actor.apply)(policies, shared)
-    distributions = jax.tree.map(lambda leaf: leaf.reshape(-1, leaf.shape[-1]), distributions)
-    return networks.tremble(distributions, noise) if noise else distributions
+    return jax.tree.map(lambda leaf: leaf.reshape(-1, leaf.shape[-1]), distributions)
 
 
 def _make_batch(
@@ -324,8 +321,8 @@ def _learn(
 
     Games are exchangeable, so each minibatch is a fixed share of them: a shuffle that differs
     between the members of a population would cost as much as the learning itself on a CPU.
-    Games of several styles lie in the order of their styles; with `strided` a minibatch takes
-    every n-th game, and so games of all styles.
+    Games of several styles or frozen partners lie in the order of these; with `strided` a
+    minibatch takes every n-th game, and so games of all of them.
     """
     optimizer = make_optimizer(config)
 
