@@ -32,6 +32,23 @@ def test_times_of_the_pot_counted_by_hand():
     assert limits.turns == 1 + (397 - 32) // 35
 
 
+def test_counters_are_empty_at_first_and_a_soup_lies_in_the_way():
+    # left_no_dish of diverse_coordination: the partner alone reaches the pot, and onions two cells
+    # beside it. It walks three steps, turns, takes, steps back, turns and pots in step 7; further
+    # onions may come over the counter, one in four steps: 7, 11, 15, the start in 16.
+    env = envs.make("overcooked/diverse_coordination")
+    limits, out_of_reach = pot_times.pot_times(relaxed(env, "left_no_dish").market, 400)
+    assert limits.first_soup == 36
+    assert out_of_reach.turns == 0
+    # After a soup is taken: to the wall, the soup on it, turn, an onion, back, turn, pot: 7 steps,
+    # 11, 15, the start in 16, 20 to cook. A delivery takes four steps.
+    assert limits.turns == 1 + (395 - 36) // 36 == 10
+    # Without onions of its own, the first one comes over the counter two steps later: the ego
+    # walks three steps, turns, takes, turns and puts it down in step 6; three steps to the pot.
+    limits, _ = pot_times.pot_times(relaxed(env, "left_no_onion").market, 400)
+    assert limits.first_soup == 38
+
+
 @pytest.mark.parametrize(("max_steps", "soups"), [(104, 2), (105, 3), (400, 11)])
 def test_a_pot_that_cooks_long_limits_the_soups(max_steps, soups):
     # Deliveries in steps 34, 69, 104, …

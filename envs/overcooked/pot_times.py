@@ -1,10 +1,12 @@
 """How soon and how often a pot can give a soup, at best: limits that prices cannot know.
 
 All are lower bounds on numbers of steps: the other player is never in the way, and a counter
-offers any item at any time.
+offers any item at any time. But what is there at first, somebody must have brought; and where a
+soup was just put, there is nothing else.
 """
 
 import dataclasses
+from collections.abc import Sequence
 
 import numpy as np
 
@@ -12,6 +14,7 @@ from envs.overcooked import layouts
 from envs.overcooked.market import (
     EMPTY,
     WITH_DISH,
+    WITH_INGREDIENT,
     WITH_SOUP,
     Market,
     Trades,
@@ -62,9 +65,9 @@ def _times_of(
         potting = _steps_to_pot(walker, trades, pot)
         cooks.append(
             {
-                "first": int(potting[walker.start, EMPTY]) - 1,
+                "first": _steps_to_first_potting(market, agent, pot) - 1,
                 "again": int(potting[beside, EMPTY].min()),
-                "after_soup": int(potting[beside, WITH_SOUP].min()),
+                "after_soup": int(_steps_after_soup(market, agent, pot)[beside].min()),
             }
         )
         taken_to_delivered = min(taken_to_delivered, int(delivery[agent][beside].min()))
@@ -96,19 +99,103 @@ def _nth_potting(cooks: list[tuple[int, int]], count: int) -> int:
     return sorted(first + again * n for first, again in cooks for n in range(count))[count - 1]
 
 
-def _steps_to_pot(walker: Walker, trades: Trades, pot: int) -> np.ndarray:
-    """Fewest steps until an ingredient is in the pot, by place and hands, int [Q, hands]."""
-    steps = np.full(trades.possible.shape[:2], NEVER)
+def _steps_to_pot(
+    walker: Walker, trades: Trades, pot: int, closed: Sequence[int] = ()
+) -> np.ndarray:
+    """Fewest steps until an ingredient is in the pot, by place and hands, int [Q, hands].
+
+    From the stations `closed` nothing is taken, and no soup is put there.
+    """
     goal = trades.possible & (trades.pot == pot)
     goal[:, [EMPTY, WITH_DISH, WITH_SOUP]] = False
+    return _fewest_steps(walker, trades, goal, closed)
+
+
+def _fewest_steps(
+    walker: Walker, trades: Trades, goal: np.ndarray, closed: Sequence[int] = ()
+) -> np.ndarray:
+    """Fewest steps until one of the trades `goal` is made, by place and hands, int [Q, hands]."""
+    possible = trades.possible.copy()
+    possible[np.ix_(np.isin(walker.face, closed), [EMPTY, WITH_SOUP])] = False
+    steps = np.full(possible.shape[:2], NEVER)
     while True:
         after = steps[np.arange(len(steps))[:, None, None], trades.hands]
-        traded = np.where(goal, 0, np.where(trades.possible, after, NEVER)).min(axis=-1)
+        traded = np.where(goal, 0, np.where(possible, after, NEVER)).min(axis=-1)
         moved = steps[walker.arrive].min(axis=1)
         new = np.minimum(steps, 1 + np.minimum(traded, moved))
         if (new == steps).all():
             return steps
         steps = new
+
+
+def _steps_to_first_potting(market: Market, agent: int, pot: int) -> int:
+    """Fewest steps from the start until a player puts an ingredient in the pot.
+
+    It fetches the ingredient itself, or takes it from a counter to which the other brought it.
+    """
+    walker, trades = market.walkers[agent], market.trades[agent]
+    other, of_other = market.walkers[1 - agent], market.trades[1 - agent]
+    counters = list(range(market.layout.num_counters))
+    best = int(_steps_to_pot(walker, trades, pot, closed=counters)[walker.start, EMPTY])
+    potting = _steps_to_pot(walker, trades, pot)
+    for counter in counters:
+        beside = walker.face == counter
+        if not beside.any():
+            continue
+        goal = _put_on(other, of_other, counter)
+        brought = _fewest_steps(other, of_other, goal, closed=counters)[other.start, EMPTY]
+        # It may be taken in the very step in which it was put there.
+        best = min(best, int(brought + potting[beside, WITH_INGREDIENT].min()))
+    return best
+
+
+def _steps_after_soup(market: Market, agent: int, pot: int) -> np.ndarray:
+    """Fewest steps of a player with a soup until it puts an ingredient in the pot, int [Q].
+
+    The counter on which it puts the soup has nothing else to offer until the other player has
+    taken the soup away and brought an ingredient there.
+    """
+    walker, trades = market.walkers[agent], market.trades[agent]
+    potting = _steps_to_pot(walker, trades, pot)
+    # By place: steps after the soup has been put down at the station that is faced there.
+    put_down = potting[:, EMPTY].copy()
+    for counter in range(market.layout.num_counters):
+        beside = walker.face == counter
+        if not beside.any():
+            continue
+        elsewhere = _steps_to_pot(walker, trades, pot, closed=[counter])[:, EMPTY]
+        refilled = _steps_to_refill(market, 1 - agent, counter)
+        from_there = refilled + potting[beside, WITH_INGREDIENT].min()
+        put_down[beside] = np.minimum(elsewhere, from_there)[beside]
+    drops = (trades.possible[:, WITH_SOUP] & (trades.hands[:, WITH_SOUP] == EMPTY)).any(axis=-1)
+    steps = np.full(len(walker.cell), NEVER)
+    while True:
+        dropped = np.where(drops, put_down, NEVER)
+        new = np.minimum(steps, 1 + np.minimum(dropped, steps[walker.arrive].min(axis=1)))
+        if (new == steps).all():
+            return steps
+        steps = new
+
+
+def _steps_to_refill(market: Market, agent: int, counter: int) -> int:
+    """Fewest steps until a player has taken a soup from a counter and put an ingredient there.
+
+    Counted from the step in which the soup was put there; it may be taken in that very step.
+    """
+    walker, trades = market.walkers[agent], market.trades[agent]
+    beside = walker.face == counter
+    if not beside.any():
+        return NEVER
+    bringing = _fewest_steps(walker, trades, _put_on(walker, trades, counter), closed=[counter])
+    return int(bringing[beside, WITH_SOUP].min())
+
+
+def _put_on(walker: Walker, trades: Trades, counter: int) -> np.ndarray:
+    """The trades that put an ingredient on a counter, bool [Q, hands, trade]."""
+    goal = trades.possible & (trades.hands == EMPTY)
+    goal[walker.face != counter] = False
+    goal[:, [EMPTY, WITH_DISH, WITH_SOUP]] = False
+    return goal
 
 
 def _steps_to_deliver(market: Market) -> tuple[np.ndarray, np.ndarray]:
