@@ -129,6 +129,18 @@ def sample(key: Array, distribution: Distribution) -> Array:
     return jax.random.categorical(key, distribution)
 
 
+def tremble(distribution: Distribution, chance: float) -> Distribution:
+    """The distribution that plays uniformly at random with a `chance` in [0, 1).
+
+    Raises:
+        TypeError: if the distribution is a `Gaussian`, which has no uniform action.
+    """
+    if isinstance(distribution, Gaussian):
+        raise TypeError("tremble takes the logits of a categorical, got a Gaussian")
+    uniform = 1.0 / distribution.shape[-1]
+    return jnp.log((1.0 - chance) * jax.nn.softmax(distribution) + chance * uniform)
+
+
 def mode(distribution: Distribution) -> Array:
     """The most probable action: argmax of the logits, or the mean."""
     if isinstance(distribution, Gaussian):

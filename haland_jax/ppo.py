@@ -231,7 +231,7 @@ def _rollout(
     if isinstance(state.partner, Learner):
         partner = partial(actors.partner.apply, state.partner.actor)
     else:
-        partner = partial(_frozen_partners, actors.partner, state.partner)
+        partner = partial(_frozen_partners, actors.partner, config.partner_noise, state.partner)
     play = _over_games(lambda style, key, game, actions: env.step(key, game, actions, style), style)
     restart_all = _over_games(_restart(env, random_share), style)
 
@@ -272,12 +272,15 @@ def _rollout(
     return state.replace(env_states=env_states, observations=observations), steps
 
 
-def _frozen_partners(actor: MLPActor, policies: Policy, observation: jax.Array) -> Any:
-    """Each of the frozen partners plays an equal share of the games."""
+def _frozen_partners(
+    actor: MLPActor, noise: float, policies: Policy, observation: jax.Array
+) -> Any:
+    """Each of the frozen partners plays an equal share of the games, with trembling hands."""
     num_partners = jax.tree.leaves(policies)[0].shape[0]
     shared = observation.reshape(num_partners, -1, observation.shape[-1])
     distributions: Any = jax.vmap(actor.apply)(policies, shared)
-    return jax.tree.map(lambda leaf: leaf.reshape(-1, leaf.shape[-1]), distributions)
+    distributions = jax.tree.map(lambda leaf: leaf.reshape(-1, leaf.shape[-1]), distributions)
+    return networks.tremble(distributions, noise) if noise else distributions
 
 
 def _make_batch(

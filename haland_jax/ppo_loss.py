@@ -39,6 +39,8 @@ class PPOConfig:
         random_start_until: progress up to which the share stays as it is.
         final_random_start: see `random_start`. Some random moments to the end keep both players
             from conventions that only the two of them share.
+        partner_noise: chance that a frozen partner plays a random action instead of its own,
+            so that the ego meets more than the conventions of the partners it trains with.
     """
 
     total_steps: int = 1_000_000
@@ -62,6 +64,7 @@ class PPOConfig:
     random_start: float = 0.9
     random_start_until: float = 0.5
     final_random_start: float = 0.4
+    partner_noise: float = 0.0
 
     def __post_init__(self):
         if self.num_envs % self.num_minibatches:

@@ -41,6 +41,7 @@ def universal_config(total_steps: int, num_envs: int = 192, num_minibatches: int
         num_envs=num_envs,
         num_minibatches=num_minibatches,
         confined_until=0.0,
+        partner_noise=0.1,
     )
 
 
