@@ -13,9 +13,13 @@ from haland_jax.universal import UniversalConfig, universal_config
 
 DEFAULT_ENVIRONMENT = "overcooked/diverse_coordination"
 
-TRAINING_LENGTH = {"overcooked/crossway": 1.7, "lbf/spread": 0.4}
-"""Factors on the joint training: in the crossway both players must learn to give way; Spread is
-learnt within 200,000 steps."""
+TRAINING_LENGTH = {
+    "overcooked/crossway": 1.7,
+    "overcooked/diverse_orders": 2.0,
+    "lbf/spread": 0.4,
+}
+"""Factors on the joint training: in the crossway both players must learn to give way, and in
+`diverse_orders` to share the work in two rooms; Spread is learnt within 200,000 steps."""
 
 
 @dataclasses.dataclass(frozen=True)

@@ -8,7 +8,7 @@ import pytest
 from drawn_kitchen import DrawnKitchen, content_code
 
 import envs
-from envs.overcooked import reward
+from envs.overcooked import dynamics, reward
 from envs.overcooked.reward import ShapingWeights
 
 WEIGHTS = ShapingWeights(
@@ -21,6 +21,7 @@ WEIGHTS = ShapingWeights(
     unordered_delivery=-1.0,
     hand_over=2.0,
     way=0.0,
+    bring=0.0,
 )
 
 
@@ -189,7 +190,7 @@ def test_every_guided_term_was_seen_in_these_tests(rooms, kitchen):
     found = guided(rooms, rooms.style("left_no_onion"), kitchen.play())
     assert set(found) == {
         *("potting", "spoilt", "dish", "start_full", "soup_taken"),
-        *("unordered_soup_taken", "unordered_delivery", "hand_over", "way"),
+        *("unordered_soup_taken", "unordered_delivery", "hand_over", "way", "bring"),
     }
 
 
@@ -247,6 +248,30 @@ def test_a_soup_is_carried_to_where_it_pays(crossway):
     assert way_term(crossway, kitchen, "west", "stay") == [0.5, 0.5]
     kitchen.place(0, 3, 3, held="oo")
     assert way_term(crossway, kitchen, "west", "stay") == [0, 0], "nobody ordered it"
+
+
+def bring_term(orders, kitchen, held, action) -> list[float]:
+    """The term for a step of the ego in the middle, two steps from either pot."""
+    kitchen.place(0, 4, 1, held=held)
+    weights = dataclasses.replace(WEIGHTS, bring=0.5)
+    style = orders.style("onion_2")
+    return np.asarray(guided(orders, style, kitchen.play(action), weights)["bring"]).tolist()
+
+
+def test_an_ingredient_is_brought_to_the_nearest_pot_that_takes_it(orders):
+    kitchen = DrawnKitchen(orders.layout, orders.style("onion_2"))
+    kitchen.place(1, 4, 3)
+    # Only the carrier is paid.
+    assert bring_term(orders, kitchen, "onion", "west") == [0.5, 0]
+    assert bring_term(orders, kitchen, "onion", "east") == [0.5, 0]
+    for content, timer in (("ooo", 3), ("ooo", dynamics.IDLE), ("t", dynamics.IDLE)):
+        kitchen.fill(2, 2, content, timer)
+        assert bring_term(orders, kitchen, "onion", "west") == [-0.5, 0], content
+        assert bring_term(orders, kitchen, "onion", "east") == [0.5, 0], content
+    kitchen.fill(2, 2, "oo")
+    assert bring_term(orders, kitchen, "onion", "west") == [0.5, 0]
+    for useless in ("tomato", "dish", ""):
+        assert bring_term(orders, kitchen, useless, "west") == [0, 0], useless
 
 
 def test_reference_shaping_pays_any_potting_dish_and_soup(orders):

@@ -30,7 +30,9 @@ class ShapingWeights:
     earns less when it is taken from the pot. Starting an unfinished pot costs nothing: any
     fine keeps random players, who start the pot by accident all the time, from learning to
     use it at all (measured: docs/paper_map.md). `way` pays both players for each step by which
-    a carrier's way gets shorter, so that giving way is paid at once.
+    a carrier's way gets shorter, so that giving way is paid at once. `bring` pays a player for
+    each step by which it brings an ingredient nearer to a pot that takes it: where one pot is
+    full, the next is worth the walk.
     """
 
     potting: float = 3.0
@@ -42,6 +44,7 @@ class ShapingWeights:
     unordered_delivery: float = -1.0
     hand_over: float = 1.0
     way: float = 0.3
+    bring: float = 0.3
 
 
 def order_values(orders: tuple[int, ...], soup_reward: float = 20.0) -> np.ndarray:
@@ -185,6 +188,11 @@ def guided_shaping_terms(
             clear_way(layout, transition.after, pays, way)
             - clear_way(layout, transition.before, pays, way),
         ),
+        "bring": weights.bring
+        * (
+            brought_near(layout, transition.after, pays, way)
+            - brought_near(layout, transition.before, pays, way)
+        ),
     }
 
 
@@ -197,8 +205,7 @@ def clear_way(layout: Layout, state: State, pays: jax.Array, way: jax.Array) -> 
     """
     kinds = np.array(list(layout.station_kinds))
     pots, serving = np.flatnonzero(kinds == "P"), np.flatnonzero(kinds == "S")
-    agents = np.arange(2)
-    steps = way[agents, state.cell[::-1], state.cell]
+    steps = _steps_to_stations(state, way)
     wants_dish = state.pot_timer >= 0
     content = jnp.maximum(state.held - dynamics.SOUP, 0)
     wants_soup = pays[serving][:, content].T > 0
@@ -206,3 +213,25 @@ def clear_way(layout: Layout, state: State, pays: jax.Array, way: jax.Array) -> 
     wanted = jnp.concatenate([holds_dish[:, None] & wants_dish, wants_soup], axis=1)
     nearest = jnp.min(jnp.where(wanted, steps[:, np.r_[pots, serving]], paths.REACH), axis=1)
     return jnp.sum(paths.REACH - nearest).astype(jnp.float32)
+
+
+def brought_near(layout: Layout, state: State, pays: jax.Array, way: jax.Array) -> jax.Array:
+    """How near each player is with an ingredient to a pot that takes it, float32 [agent], >= 0.
+
+    A pot takes what, added to its content, can still become a soup that pays. The change in a
+    step is a potential-based reward (Ng et al., 1999).
+    """
+    pots = np.flatnonzero(np.array(list(layout.station_kinds)) == "P")
+    steps = _steps_to_stations(state, way)[:, pots]
+    holds = (state.held == dynamics.ONION) | (state.held == dynamics.TOMATO)
+    ingredient = jnp.where(state.held == dynamics.ONION, 4, 1)
+    becomes = jnp.minimum(state.pot_content + ingredient[:, None], NUM_CONTENTS - 1)
+    useful = reachable_values(jnp.max(pays, axis=0))[becomes] > 0
+    room = (state.pot_timer < 0) & (dynamics.num_ingredients(state.pot_content) < 3)
+    nearest = jnp.min(jnp.where(holds[:, None] & useful & room, steps, paths.REACH), axis=1)
+    return (paths.REACH - nearest).astype(jnp.float32)
+
+
+def _steps_to_stations(state: State, way: jax.Array) -> jax.Array:
+    """Steps of each player to each station around the other, int32 [agent, K]."""
+    return way[np.arange(2), state.cell[::-1], state.cell]
