@@ -230,7 +230,7 @@ def overnight(environment: str, seed: int) -> RunConfig:
             oracle_candidates=2,
         ),
         compression=CompressionConfig(
-            fit=FitConfig(learning_rate=1e-2, steps=5000, warmup_steps=100)
+            fit=FitConfig(learning_rate=5e-3, steps=5000, warmup_steps=100)
         ),
         diffusion=DiffusionConfig(
             clip=8.0,

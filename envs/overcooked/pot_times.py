@@ -116,7 +116,8 @@ def _fewest_steps(
 ) -> np.ndarray:
     """Fewest steps until one of the trades `goal` is made, by place and hands, int [Q, hands]."""
     possible = trades.possible.copy()
-    possible[np.ix_(np.isin(walker.face, closed), [EMPTY, WITH_SOUP])] = False
+    shut = np.isin(walker.face, closed)
+    possible[shut, EMPTY] = possible[shut, WITH_SOUP] = False
     steps = np.full(possible.shape[:2], NEVER)
     while True:
         after = steps[np.arange(len(steps))[:, None, None], trades.hands]
