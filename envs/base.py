@@ -106,6 +106,16 @@ class Environment(Protocol):
         ...
 
 
+def pick_style(env: Any, name: str) -> Any:
+    """Returns one of an environment's styles; ValueError for an unknown name."""
+    if name not in env.style_names:
+        raise ValueError(
+            f"unknown style {name!r} of {env.name}; expected one of {', '.join(env.style_names)}"
+        )
+    index = env.style_names.index(name)
+    return jax.tree.map(lambda leaf: leaf[index], env.styles)
+
+
 def check_partner_sight(sight: int | None) -> None:
     """Raises ValueError unless `sight` is a distance in cells, or None for everywhere."""
     if sight is not None and sight < 0:

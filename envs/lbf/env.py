@@ -8,7 +8,7 @@ from typing import Any, ClassVar, Literal
 import jax
 import jax.numpy as jnp
 
-from envs.base import Pair, TimeStep, check_partner_sight
+from envs.base import Pair, TimeStep, check_partner_sight, pick_style
 from envs.lbf import dynamics, events, features, observation, reward, spread, styles
 from envs.lbf.dynamics import Rules, State
 from envs.lbf.reward import ShapingWeights
@@ -83,13 +83,7 @@ class Spread:
 
     def style(self, name: str) -> Style:
         """Returns one style; ValueError for an unknown name."""
-        if name not in self.style_names:
-            raise ValueError(
-                f"unknown style {name!r} of {self.name}; expected one of "
-                f"{', '.join(self.style_names)}"
-            )
-        index = self.style_names.index(name)
-        return jax.tree.map(lambda leaf: leaf[index], self.styles)
+        return pick_style(self, name)
 
     def upper_bounds(self) -> dict[str, float]:
         """Returns 1 for each style: the target pays once and ends the game."""

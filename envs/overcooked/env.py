@@ -8,7 +8,7 @@ from typing import ClassVar, Literal
 import jax
 import jax.numpy as jnp
 
-from envs.base import Pair, TimeStep, check_partner_sight
+from envs.base import Pair, TimeStep, check_partner_sight, pick_style
 from envs.overcooked import dynamics, events, layouts, moments, observation, reward, styles
 from envs.overcooked.dynamics import State, Transition
 from envs.overcooked.layouts import Layout
@@ -76,13 +76,7 @@ class Overcooked:
 
     def style(self, name: str) -> Style:
         """Returns one style; ValueError for an unknown name."""
-        if name not in self.style_names:
-            raise ValueError(
-                f"unknown style {name!r} of {self.name}; expected one of "
-                f"{', '.join(self.style_names)}"
-            )
-        index = self.style_names.index(name)
-        return jax.tree.map(lambda leaf: leaf[index], self.styles)
+        return pick_style(self, name)
 
     def upper_bounds(self) -> dict[str, float]:
         """Returns a return for each style that no two players can exceed; takes seconds."""
