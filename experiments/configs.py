@@ -225,7 +225,7 @@ def overnight(environment: str, seed: int) -> RunConfig:
             held_out_seeds=3,
             spare_seeds=2,
             joint=PPOConfig(total_steps=1_200_000),
-            refit=best_response_config(900_000, num_envs=36),
+            refit=best_response_config(900_000, num_envs=40),
             oracle=oracle_config(200_000),
             oracle_candidates=2,
         ),
@@ -237,7 +237,7 @@ def overnight(environment: str, seed: int) -> RunConfig:
             frequency_jitter=0.08,
             fit=FitConfig(learning_rate=2e-3, steps=4000, warmup_steps=200, ema_decay=0.999),
         ),
-        universal=UniversalConfig(training=universal_config(10_000_000)),
+        universal=UniversalConfig(training=universal_config(10_000_000, num_envs=200)),
         evaluation=EvaluationConfig(games=32),
     )
     return _adapted(config)
@@ -262,7 +262,7 @@ def paper(environment: str, seed: int) -> RunConfig:
             fit=FitConfig(learning_rate=2e-3, steps=10_000, warmup_steps=200, ema_decay=0.999),
         ),
         universal=UniversalConfig(
-            seeds=3, training=universal_config(50_000_000, num_envs=320, num_minibatches=8)
+            seeds=3, training=universal_config(50_000_000, num_envs=336, num_minibatches=8)
         ),
         evaluation=EvaluationConfig(games=32, samples=4),
     )

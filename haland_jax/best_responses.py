@@ -82,7 +82,7 @@ def best_response_refits(
         )
         times = 2 * times
     partners = jax.tree.map(
-        lambda leaf: jnp.repeat(leaf[:, None], times, axis=1), population.train_partners
+        lambda leaf: jnp.repeat(leaf[:, None], times, axis=1), population.known_partners
     )
     return init_refits(
         env, config.refit, key, flatten(egos), flatten(partners), repeat_styles(env, times)

@@ -68,9 +68,11 @@ class PartnersConfig:
     Attributes:
         train_seeds: partners of each style that the method learns from.
         held_out_seeds: partners of each style that it is judged with.
-        spare_seeds: further seeds of each style that are trained and may be rejected.
+        spare_seeds: further seeds of each style, so that the worst pairs can be rejected; best
+            responses learn with their partners too.
         joint: training of partner and ego together.
-        refit: training of an ego against all frozen training partners of its style.
+        refit: training of an ego against all frozen partners of its style that are not held
+            out.
         oracle: training of an ego against one frozen held-out partner.
         oracle_candidates: egos that are refitted for each held-out partner.
         universal_start: also refit the universal ego, and keep the better start of each style.
@@ -82,7 +84,7 @@ class PartnersConfig:
     spare_seeds: int = 2
     joint: PPOConfig = dataclasses.field(default_factory=PPOConfig)
     refit: PPOConfig = dataclasses.field(
-        default_factory=lambda: best_response_config(900_000, num_envs=40)
+        default_factory=lambda: best_response_config(900_000, num_envs=42)
     )
     oracle: PPOConfig = dataclasses.field(default_factory=lambda: oracle_config(300_000))
     oracle_candidates: int = 3
@@ -93,16 +95,21 @@ class PartnersConfig:
         for name in ("train_seeds", "held_out_seeds", "oracle_candidates", "evaluation_games"):
             if getattr(self, name) < 1:
                 raise ValueError(f"{name} is {getattr(self, name)}; expected at least 1")
-        if self.refit.num_envs % self.train_seeds:
+        if self.refit.num_envs % self.known_seeds:
             raise ValueError(
-                f"refit.num_envs is {self.refit.num_envs}; expected a multiple of "
-                f"train_seeds = {self.train_seeds}, since the partners share the games"
+                f"refit.num_envs is {self.refit.num_envs}; expected a multiple of train_seeds + "
+                f"spare_seeds = {self.known_seeds}, since the partners share the games"
             )
 
     @property
     def num_seeds(self) -> int:
         """Seeds of each style that are trained."""
-        return self.train_seeds + self.held_out_seeds + self.spare_seeds
+        return self.known_seeds + self.held_out_seeds
+
+    @property
+    def known_seeds(self) -> int:
+        """Seeds of each style that the method may learn with: all that are not held out."""
+        return self.train_seeds + self.spare_seeds
 
 
 class Player(PyTreeNode):
@@ -116,23 +123,48 @@ class Population(PyTreeNode):
     """The partners and egos of an environment; leading axes [style, seed].
 
     Attributes:
-        train_partners: actors of the training partners.
-        held_out_partners: actors of the held-out partners.
-        train_egos: the egos that learnt beside the training partners.
-        held_out_egos: the egos that learnt beside the held-out partners.
-        joint_returns: mean return of every trained pair, rejected ones included,
-            float32 [style, num_seeds].
-        train_index: which of the trained seeds became training partners, int32.
-        held_out_index: which became held-out partners, int32.
+        partners: actors of all partners that were trained.
+        egos: the egos that learnt beside them.
+        joint_returns: mean return of each pair, float32 [style, num_seeds].
+        train_index: which seeds became training partners, int32 [style, train_seeds].
+        held_out_index: which became held-out partners, int32 [style, held_out_seeds].
     """
 
-    train_partners: Policy
-    held_out_partners: Policy
-    train_egos: Player
-    held_out_egos: Player
+    partners: Policy
+    egos: Player
     joint_returns: jax.Array
     train_index: jax.Array
     held_out_index: jax.Array
+
+    @property
+    def train_partners(self) -> Policy:
+        """Actors of the training partners, [style, train_seeds]."""
+        return take_seeds(self.partners, self.train_index)
+
+    @property
+    def held_out_partners(self) -> Policy:
+        """Actors of the held-out partners, [style, held_out_seeds]."""
+        return take_seeds(self.partners, self.held_out_index)
+
+    @property
+    def known_partners(self) -> Policy:
+        """Actors of all that are not held out, the rejected ones included, [style, known_seeds].
+
+        The more ways of sharing the work an ego has met, the better it serves those it has not.
+        """
+        seeds = np.arange(self.joint_returns.shape[1])
+        known = [np.setdiff1d(seeds, held_out) for held_out in np.asarray(self.held_out_index)]
+        return take_seeds(self.partners, np.stack(known))
+
+    @property
+    def train_egos(self) -> Player:
+        """The egos that learnt beside the training partners, [style, train_seeds]."""
+        return take_seeds(self.egos, self.train_index)
+
+    @property
+    def held_out_egos(self) -> Player:
+        """The egos that learnt beside the held-out partners, [style, held_out_seeds]."""
+        return take_seeds(self.egos, self.held_out_index)
 
 
 def flatten(tree: Any) -> Any:
@@ -219,7 +251,7 @@ def select_seeds(
     return kept[:, sorted(train)].astype(np.int32), kept[:, held_out].astype(np.int32)
 
 
-def take_seeds(tree: Any, index: np.ndarray) -> Any:
+def take_seeds(tree: Any, index: np.ndarray | jax.Array) -> Any:
     """Picks seeds by style: leaves [style, seed, ...], index [style, n] -> [style, n, ...]."""
     rows = np.arange(index.shape[0])[:, None]
     return jax.tree.map(lambda leaf: leaf[rows, index], tree)
@@ -228,7 +260,7 @@ def take_seeds(tree: Any, index: np.ndarray) -> Any:
 def make_population(
     env: Environment, config: PartnersConfig, state: TrainState, returns: np.ndarray
 ) -> Population:
-    """Keeps the best pairs.
+    """Says which pairs train and which are held out, by `select_seeds`.
 
     Args:
         env: the environment.
@@ -238,13 +270,9 @@ def make_population(
     """
     num_styles = len(env.style_names)
     train, held_out = select_seeds(returns, config.train_seeds, config.held_out_seeds)
-    egos = unflatten(Player(state.ego.actor, state.ego.critic), num_styles)
-    partners = unflatten(state.partner.actor, num_styles)
     return Population(
-        train_partners=take_seeds(partners, train),
-        held_out_partners=take_seeds(partners, held_out),
-        train_egos=take_seeds(egos, train),
-        held_out_egos=take_seeds(egos, held_out),
+        partners=unflatten(state.partner.actor, num_styles),
+        egos=unflatten(Player(state.ego.actor, state.ego.critic), num_styles),
         joint_returns=jnp.asarray(returns),
         train_index=jnp.asarray(train),
         held_out_index=jnp.asarray(held_out),

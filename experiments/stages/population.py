@@ -50,26 +50,23 @@ def load_population(run: Run) -> Population:
     config, env = run.config.partners, run.env
     shapes = jax.eval_shape(lambda key: partners.init_pairs(env, config, key), jax.random.key(0))
 
-    def seeds(tree: Any, count: int) -> Any:
+    styles = len(env.style_names)
+
+    def by_style(tree: Any) -> Any:
         return jax.tree.map(
             lambda leaf: jax.ShapeDtypeStruct(
-                (len(env.style_names), count, *leaf.shape[1:]), leaf.dtype
+                (styles, config.num_seeds, *leaf.shape[1:]), leaf.dtype
             ),
             tree,
         )
 
-    egos = Player(shapes.ego.actor, shapes.ego.critic)
-    train, held_out = config.train_seeds, config.held_out_seeds
-    styles = len(env.style_names)
     shape: Any = jax.ShapeDtypeStruct
     like = Population(
-        train_partners=seeds(shapes.partner.actor, train),
-        held_out_partners=seeds(shapes.partner.actor, held_out),
-        train_egos=seeds(egos, train),
-        held_out_egos=seeds(egos, held_out),
+        partners=by_style(shapes.partner.actor),
+        egos=by_style(Player(shapes.ego.actor, shapes.ego.critic)),
         joint_returns=shape((styles, config.num_seeds), jnp.float32),
-        train_index=shape((styles, train), jnp.int32),
-        held_out_index=shape((styles, held_out), jnp.int32),
+        train_index=shape((styles, config.train_seeds), jnp.int32),
+        held_out_index=shape((styles, config.held_out_seeds), jnp.int32),
     )
     return checkpoint.restore(run.path("partners", "population"), like)
 

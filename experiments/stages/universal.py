@@ -36,7 +36,7 @@ def train_universal_in(
         task: the progress.
     """
     config, env = run.config.universal, Labelled(game)
-    partners = load_population(run).train_partners
+    partners = load_population(run).known_partners
     key = run.key(STAGE)
     state, returns = train_population(
         env,
@@ -69,7 +69,7 @@ def load_universal(run: Run) -> dict[str, Player]:
 def load_universal_in(run: Run, game: Environment, stage: str) -> dict[str, Player]:
     """The same for the egos of `train_universal_in`."""
     config, env = run.config.universal, Labelled(game)
-    partners = load_population(run).train_partners
+    partners = load_population(run).known_partners
     shapes = jax.eval_shape(
         lambda key: universal.init_universal(env, config, key, partners), jax.random.key(0)
     )
