@@ -20,7 +20,7 @@ CONFIG = PartnersConfig(
     held_out_seeds=2,
     spare_seeds=1,
     joint=TINY,
-    refit=TINY,
+    refit=dataclasses.replace(TINY, num_envs=6, total_steps=120),
     oracle=TINY,
     oracle_candidates=2,
     evaluation_games=3,
@@ -117,6 +117,8 @@ def test_the_population_holds_the_chosen_pairs(pairs, population):
     for kept, members in (
         (population.train_partners, [[1, 4], [9, 7]]),
         (population.held_out_partners, [[3, 0], [8, 6]]),
+        # All but the held-out ones, in the order of the seeds; 2 and 5 are the worst.
+        (population.known_partners, [[1, 2, 4], [5, 7, 9]]),
     ):
         jax.tree.map(
             lambda leaf, every, index=members: np.testing.assert_array_equal(
@@ -129,13 +131,13 @@ def test_the_population_holds_the_chosen_pairs(pairs, population):
     np.testing.assert_array_equal(population.train_index, [[1, 4], [4, 2]])
 
 
-def test_each_ego_is_refitted_against_all_training_partners_of_its_style(game, population):
+def test_each_ego_is_refitted_against_all_known_partners_of_its_style(game, population):
     state = best_responses.best_response_refits(game, CONFIG, jax.random.key(1), population)
     np.testing.assert_array_equal(mark(state.ego.actor), [1, 4, 9, 7])
     for frozen, trained in zip(
-        jax.tree.leaves(state.partner), jax.tree.leaves(population.train_partners), strict=True
+        jax.tree.leaves(state.partner), jax.tree.leaves(population.known_partners), strict=True
     ):
-        # [member, partner, ...]: both training partners of the member's style.
+        # [member, partner, ...]: all partners of the member's style that are not held out.
         np.testing.assert_array_equal(frozen, np.asarray(trained)[[0, 0, 1, 1]])
 
 
@@ -145,7 +147,7 @@ def test_the_universal_ego_is_refitted_beside_the_own_egos(game, population):
     state = best_responses.best_response_refits(game, CONFIG, jax.random.key(1), population, told)
     np.testing.assert_array_equal(mark(state.ego.actor), [1, 4, 101, 101, 9, 7, 109, 109])
     for frozen, trained in zip(
-        jax.tree.leaves(state.partner), jax.tree.leaves(population.train_partners), strict=True
+        jax.tree.leaves(state.partner), jax.tree.leaves(population.known_partners), strict=True
     ):
         expected = np.asarray(trained)[[0, 0, 0, 0, 1, 1, 1, 1]]
         np.testing.assert_array_equal(frozen, expected)
@@ -233,5 +235,5 @@ def test_numbers_below_one_are_refused(name):
 
 def test_refit_games_must_be_shared_by_the_partners():
     odd = dataclasses.replace(CONFIG.refit, num_envs=32, total_steps=160)
-    with pytest.raises(ValueError, match=r"refit\.num_envs is 32; expected a multiple .* = 5"):
+    with pytest.raises(ValueError, match=r"refit\.num_envs is 32; expected a multiple .* = 7"):
         PartnersConfig(train_seeds=5, refit=odd)

@@ -192,7 +192,8 @@ def test_partners_that_cannot_share_the_games_are_refused():
 @pytest.mark.parametrize("preset", configs.PRESETS)
 def test_the_presets_share_the_games_of_eight_styles_in_equal_parts(preset):
     config = configs.PRESETS[preset]("overcooked/crossway", 0)
-    count = 8 * config.partners.train_seeds
+    count = 8 * config.partners.known_seeds
+    assert config.partners.refit.num_envs % config.partners.known_seeds == 0
     assert config.universal.training.num_envs % count == 0
     # No more minibatches than games of a pair of partners: each has games of every style.
     assert config.universal.training.num_minibatches * count <= (
