@@ -213,7 +213,7 @@ def _universal(results: Mapping[str, Any]) -> dict[str, str]:
     if not (trained := results.get("universal")):
         return {}
     what = (
-        "one feed-forward ego trained with the training partners of all styles "
+        "one feed-forward ego trained with all partners of all styles that are not held out "
         f"({steps_in_words(trained['steps'])} steps), {{}} the style's label"
     )
     return {UNIVERSAL: what.format("without"), UNIVERSAL_WITH_LABEL: what.format("with")}

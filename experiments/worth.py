@@ -52,7 +52,7 @@ def _for_one_ego(results: Mapping[str, Any], rows: Mapping[str, MethodSummary]) 
     plain, told = rows[UNIVERSAL], rows[UNIVERSAL_WITH_LABEL]
     steps = results["universal"]["steps"]
     said = [
-        f"One feed-forward ego that learnt with the training partners of all styles for "
+        f"One feed-forward ego that learnt with the partners of all styles for "
         f"{steps_in_words(steps)} steps earns {plain.mean:.1f} ({plain.ratio:.0%} of the Oracle) "
         f"without the style's label and {told.mean:.1f} ({told.ratio:.0%}) with it"
         f"{_budget(results)}."

@@ -1,10 +1,10 @@
 """Best responses to styled partners, and the Oracles that they are measured against.
 
-1. Each training ego is refitted against *all* frozen training partners of its style
-   (`best_response_refits`): an ego that knew one partner only keeps that partner's private
-   conventions. The universal ego that is told the style (`haland_jax.universal`) is refitted too:
-   it brings what it learnt with other styles. Of the two starts each style keeps the one whose
-   egos serve its training partners better (`better_starts`). These egos are the archive.
+1. Each training ego is refitted against *all* frozen partners of its style that are not held
+   out (`best_response_refits`): an ego that knew one partner only keeps that partner's private
+   conventions. The universal ego that is told the style (`haland_jax.universal`) is refitted
+   too: it brings what it learnt with other styles. Of the two starts each style keeps the one
+   whose egos serve its training partners better (`better_starts`). These egos are the archive.
 2. The Oracle of a held-out partner is the best of a few egos of its style refitted to that very
    partner (`oracle_refits`), chosen on other games than those it is scored on.
 """
@@ -63,7 +63,7 @@ def best_response_refits(
         env: the environment.
         config: how many.
         key: consumed.
-        population: the training partners and their egos.
+        population: the partners, and the egos that learnt beside them.
         universal: the universal ego as it plays with each style, leading axis [style], or None
             to refit the partners' own egos alone.
 

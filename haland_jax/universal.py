@@ -1,8 +1,8 @@
 """Universal egos: one ego for the partners of all styles, told the style or not.
 
 What an ego that is told nothing reaches says how much knowing the style is worth. One ego
-learns by PPO with the frozen training partners of all styles together; each partner has an
-equal share of the games, and the games of each partner have that partner's style.
+learns by PPO with the frozen partners of all styles together, but those held out; each partner
+has an equal share of the games, and the games of each partner have that partner's style.
 
 Egos that are told the style's one-hot and egos that are told nothing learn in one program:
 members [variant, seed], in the order of `VARIANTS`. Both have a slot for the label. The same
@@ -79,7 +79,7 @@ def init_universal(
         env: the environment, with labels.
         config: how many egos.
         key: consumed.
-        partners: frozen training partners, leading axes [style, seed].
+        partners: frozen partners, leading axes [style, seed].
 
     Returns:
         Training states with leading axis [variant * seed].
@@ -94,7 +94,7 @@ def init_universal(
     if training.num_envs % count:
         raise ValueError(
             f"universal.training.num_envs is {training.num_envs}; expected a multiple of the "
-            f"{count} training partners, which share the games"
+            f"{count} partners, which share the games"
         )
 
     def init_ego(everyone: Policy, key: jax.Array, styles: StylesByGame) -> TrainState:

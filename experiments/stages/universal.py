@@ -20,7 +20,7 @@ STAGE = "universal"
 
 
 def train_universal(run: Run, task: StageProgress) -> dict[str, Any]:
-    """Stage 1b: trains egos with the training partners of all styles, told the style or not."""
+    """Stage 1b: trains egos with the partners of all styles, told the style or not."""
     return train_universal_in(run, run.env, STAGE, task)
 
 
@@ -30,7 +30,7 @@ def train_universal_in(
     """Trains such egos in a variant of the run's environment.
 
     Args:
-        run: whose training partners they learn with.
+        run: whose partners they learn with, but those held out.
         game: the variant; it differs in what the ego sees at most.
         stage: folder of the run that keeps the egos.
         task: the progress.
