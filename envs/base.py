@@ -10,6 +10,7 @@ from typing import Any, Literal, NamedTuple, Protocol
 
 import jax
 import jax.numpy as jnp
+import numpy as np
 from flax.struct import PyTreeNode
 
 AGENTS = ("ego", "partner")
@@ -60,6 +61,20 @@ class TimeStep(PyTreeNode):
         return self.terminated | self.truncated
 
 
+class Symmetry(NamedTuple):
+    """A mirror in which an environment looks the same, with its styles exchanged.
+
+    Attributes:
+        styles: as which style each style appears, int [style].
+        observation: as which number of the partner's observation each number appears, int [O].
+        actions: as which action of the partner each action appears, int [A].
+    """
+
+    styles: np.ndarray
+    observation: np.ndarray
+    actions: np.ndarray
+
+
 class Environment(Protocol):
     """Two players, one of them (the partner) of a style that the other cannot see."""
 
@@ -72,6 +87,8 @@ class Environment(Protocol):
     num_actions: Pair
     observation_sizes: Pair
     max_steps: int
+    symmetries: tuple[Symmetry, ...]
+    """Mirrors in which the partner of one style plays as one of another style would."""
     task_language_source: Literal["events", "labels"]
     """What the task language is made of: frequencies of events (Eq. 8), or encodings of the
     style's label where events do not tell the styles apart (App. D)."""

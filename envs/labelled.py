@@ -45,6 +45,7 @@ class Labelled:
         ego, partner = env.observation_sizes
         self.observation_sizes = Pair(ego + count, partner)
         self.max_steps = env.max_steps
+        self.symmetries = env.symmetries
         self.task_language_source: Literal["events", "labels"] = env.task_language_source
 
     def style(self, name: str) -> LabelledStyle:

@@ -175,7 +175,7 @@ def smoke(environment: str, seed: int) -> RunConfig:
             translation=FitConfig(learning_rate=1e-4, steps=20, warmup_steps=5),
         ),
         universal=UniversalConfig(
-            seeds=2, training=dataclasses.replace(refit, num_envs=16, shaping=3.0)
+            seeds=2, training=dataclasses.replace(refit, num_envs=32, shaping=3.0)
         ),
         evaluation=EvaluationConfig(games=4, samples=1, batch=32),
     )
@@ -196,7 +196,7 @@ def quick(environment: str, seed: int) -> RunConfig:
             held_out_seeds=2,
             spare_seeds=1,
             joint=PPOConfig(total_steps=900_000),
-            refit=best_response_config(400_000, num_envs=36),
+            refit=best_response_config(400_000, num_envs=40),
             oracle=oracle_config(200_000),
             oracle_candidates=2,
             universal_start=False,
@@ -237,7 +237,7 @@ def overnight(environment: str, seed: int) -> RunConfig:
             frequency_jitter=0.08,
             fit=FitConfig(learning_rate=2e-3, steps=4000, warmup_steps=200, ema_decay=0.999),
         ),
-        universal=UniversalConfig(training=universal_config(10_000_000, num_envs=200)),
+        universal=UniversalConfig(training=universal_config(10_000_000, num_envs=240)),
         evaluation=EvaluationConfig(games=32),
     )
     return _adapted(config)

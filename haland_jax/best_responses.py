@@ -1,10 +1,11 @@
 """Best responses to styled partners, and the Oracles that they are measured against.
 
 1. Each training ego is refitted against *all* frozen partners of its style that are not held
-   out (`best_response_refits`): an ego that knew one partner only keeps that partner's private
-   conventions. The universal ego that is told the style (`haland_jax.universal`) is refitted
-   too: it brings what it learnt with other styles. Of the two starts each style keeps the one
-   whose egos serve its training partners better (`better_starts`). These egos are the archive.
+   out, and against those of other styles seen in a mirror (`best_response_refits`): an ego that
+   knew one partner only keeps that partner's private conventions. The universal ego that is told
+   the style (`haland_jax.universal`) is refitted too: it brings what it learnt with other styles.
+   Of the two starts each style keeps the one whose egos serve its training partners better
+   (`better_starts`). These egos are the archive.
 2. The Oracle of a held-out partner is the best of a few egos of its style refitted to that very
    partner (`oracle_refits`), chosen on other games than those it is scored on.
 """
@@ -18,7 +19,14 @@ import numpy as np
 from envs.base import Environment
 from haland_jax import ppo
 from haland_jax.networks import Policy
-from haland_jax.partners import PartnersConfig, Player, Population, flatten, repeat_styles
+from haland_jax.partners import (
+    PartnersConfig,
+    Player,
+    Population,
+    flatten,
+    repeat_styles,
+    teachers,
+)
 from haland_jax.population import over_population
 from haland_jax.ppo import PPOConfig, TrainState
 
@@ -70,6 +78,9 @@ def best_response_refits(
     Returns:
         Training states, leading axis [style * egos]; the egos of a style are those of its
         training seeds, then as many copies of the universal ego.
+
+    Raises:
+        ValueError: the partners cannot share the games in equal parts.
     """
     egos, times = population.train_egos, config.train_seeds
     if universal is not None:
@@ -81,9 +92,14 @@ def best_response_refits(
             universal,
         )
         times = 2 * times
-    partners = jax.tree.map(
-        lambda leaf: jnp.repeat(leaf[:, None], times, axis=1), population.known_partners
-    )
+    everyone = teachers(env, config, population)
+    count = jax.tree.leaves(everyone)[0].shape[1]
+    if config.refit.num_envs % count:
+        raise ValueError(
+            f"partners.refit.num_envs is {config.refit.num_envs}; expected a multiple of the "
+            f"{count} partners of a style, mirror images included, which share the games"
+        )
+    partners = jax.tree.map(lambda leaf: jnp.repeat(leaf[:, None], times, axis=1), everyone)
     return init_refits(
         env, config.refit, key, flatten(egos), flatten(partners), repeat_styles(env, times)
     )

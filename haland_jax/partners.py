@@ -17,9 +17,9 @@ import jax.numpy as jnp
 import numpy as np
 from flax.struct import PyTreeNode
 
-from envs.base import Environment
+from envs.base import Environment, Symmetry
 from haland_jax import ppo, rollout
-from haland_jax.networks import Policy
+from haland_jax.networks import Policy, layer_names
 from haland_jax.population import over_population
 from haland_jax.ppo import PPOConfig, TrainState
 
@@ -75,6 +75,8 @@ class PartnersConfig:
             out.
         oracle: training of an ego against one frozen held-out partner.
         oracle_candidates: egos that are refitted for each held-out partner.
+        mirror: also learn with the partners of other styles as they look in the environment's
+            mirrors, where it has any.
         universal_start: also refit the universal ego, and keep the better start of each style.
         evaluation_games: games of each pair in an evaluation.
     """
@@ -88,6 +90,7 @@ class PartnersConfig:
     )
     oracle: PPOConfig = dataclasses.field(default_factory=lambda: oracle_config(300_000))
     oracle_candidates: int = 3
+    mirror: bool = True
     universal_start: bool = True
     evaluation_games: int = 32
 
@@ -255,6 +258,43 @@ def take_seeds(tree: Any, index: np.ndarray | jax.Array) -> Any:
     """Picks seeds by style: leaves [style, seed, ...], index [style, n] -> [style, n, ...]."""
     rows = np.arange(index.shape[0])[:, None]
     return jax.tree.map(lambda leaf: leaf[rows, index], tree)
+
+
+def teachers(env: Environment, config: PartnersConfig, population: Population) -> Policy:
+    """Actors of all partners that egos learn with, leading axes [style, teacher].
+
+    Those that are not held out and, with `config.mirror`, their mirror images.
+    """
+    known = population.known_partners
+    return with_mirror_images(env, known) if config.mirror else known
+
+
+def with_mirror_images(env: Environment, policies: Policy) -> Policy:
+    """Adds the partners of other styles as they look in the environment's mirrors.
+
+    A partner that works on the left is, seen in a mirror, one that works on the right: further
+    conventions of each style at no cost, in the spirit of Other-Play (Hu et al., 2020).
+
+    Args:
+        env: whose `symmetries` are used.
+        policies: actors of partners, leading axes [style, seed].
+
+    Returns:
+        Actors, [style, seed * (1 + symmetries)]; the given ones come first.
+    """
+    images = [_seen_in(mirror, policies) for mirror in env.symmetries]
+    return jax.tree.map(lambda *leaves: jnp.concatenate(leaves, axis=1), policies, *images)
+
+
+def _seen_in(mirror: Symmetry, policies: Policy) -> Policy:
+    """The partners of each style that are in the mirror of one, [style, seed]."""
+    layers = dict(policies["params"])
+    names = layer_names(policies)
+    first = layers[names[0]]
+    layers[names[0]] = {**first, "kernel": first["kernel"][..., np.argsort(mirror.observation), :]}
+    shown = np.argsort(mirror.actions)
+    layers[names[-1]] = {key: leaf[..., shown] for key, leaf in layers[names[-1]].items()}
+    return jax.tree.map(lambda leaf: leaf[np.argsort(mirror.styles)], {"params": layers})
 
 
 def make_population(

@@ -192,13 +192,13 @@ def test_partners_that_cannot_share_the_games_are_refused():
 @pytest.mark.parametrize("preset", configs.PRESETS)
 def test_the_presets_share_the_games_of_eight_styles_in_equal_parts(preset):
     config = configs.PRESETS[preset]("overcooked/crossway", 0)
-    count = 8 * config.partners.known_seeds
-    assert config.partners.refit.num_envs % config.partners.known_seeds == 0
-    assert config.universal.training.num_envs % count == 0
-    # No more minibatches than games of a pair of partners: each has games of every style.
-    assert config.universal.training.num_minibatches * count <= (
-        2 * config.universal.training.num_envs
-    )
+    # Every styled kitchen has one mirror, so each partner has one image.
+    teachers = 2 * config.partners.known_seeds
+    assert config.partners.refit.num_envs % teachers == 0
+    training = config.universal.training
+    assert training.num_envs % (8 * teachers) == 0
+    # A minibatch takes every n-th game and shall have some of every style.
+    assert training.num_minibatches <= training.num_envs // 8
 
 
 def test_the_told_ego_learns_what_the_other_cannot():

@@ -7,7 +7,7 @@ import jax
 import jax.numpy as jnp
 from flax.struct import PyTreeNode
 
-from envs.base import Pair, TimeStep
+from envs.base import Pair, Symmetry, TimeStep
 
 
 class ToyStyle(PyTreeNode):
@@ -43,6 +43,7 @@ class ToyGame:
     max_steps: int = 5
     num_actions: ClassVar[Pair] = Pair(3, 2)
     observation_sizes: ClassVar[Pair] = Pair(3, 4)
+    symmetries: ClassVar[tuple[Symmetry, ...]] = ()
     task_language_source: ClassVar[Literal["events", "labels"]] = "events"
 
     @property

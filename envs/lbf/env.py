@@ -8,7 +8,7 @@ from typing import Any, ClassVar, Literal
 import jax
 import jax.numpy as jnp
 
-from envs.base import Pair, TimeStep, check_partner_sight, pick_style
+from envs.base import Pair, Symmetry, TimeStep, check_partner_sight, pick_style
 from envs.lbf import dynamics, events, features, observation, reward, spread, styles
 from envs.lbf.dynamics import Rules, State
 from envs.lbf.reward import ShapingWeights
@@ -39,6 +39,7 @@ class Spread:
     name: ClassVar[str] = "lbf/spread"
     rows: ClassVar[int] = spread.SIZE
     columns: ClassVar[int] = spread.SIZE
+    symmetries: ClassVar[tuple[Symmetry, ...]] = ()
     task_language_source: ClassVar[Literal["events", "labels"]] = "labels"
 
     def __post_init__(self):

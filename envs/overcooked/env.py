@@ -8,12 +8,13 @@ from typing import ClassVar, Literal
 import jax
 import jax.numpy as jnp
 
-from envs.base import Pair, TimeStep, check_partner_sight, pick_style
+from envs.base import Pair, Symmetry, TimeStep, check_partner_sight, pick_style
 from envs.overcooked import dynamics, events, layouts, moments, observation, reward, styles
 from envs.overcooked.dynamics import State, Transition
 from envs.overcooked.layouts import Layout
 from envs.overcooked.reward import ShapingWeights
 from envs.overcooked.styles import Style
+from envs.overcooked.symmetry import find_symmetries
 
 
 @dataclasses.dataclass(frozen=True, eq=False)
@@ -73,6 +74,13 @@ class Overcooked:
                 styles.build_style(self.layout, rule, max_steps=self.max_steps) for rule in rules
             ]
             return jax.tree.map(lambda *leaves: jnp.stack(leaves), *built)
+
+    @functools.cached_property
+    def symmetries(self) -> tuple[Symmetry, ...]:
+        """Mirrors of the kitchen and its styles; none are known for the grid encoding."""
+        if self.encoding == "grid":
+            return ()
+        return find_symmetries(self.layout, self.styles, self.styles.task.shape[-1])
 
     def style(self, name: str) -> Style:
         """Returns one style; ValueError for an unknown name."""

@@ -12,7 +12,7 @@ from experiments.progress import StageProgress
 from experiments.stages.context import Run
 from experiments.stages.population import load_population
 from experiments.training import Saver, train_population
-from haland_jax import checkpoint, universal
+from haland_jax import checkpoint, partners, universal
 from haland_jax.partners import Player
 
 CURVE_POINTS = 40
@@ -36,12 +36,12 @@ def train_universal_in(
         task: the progress.
     """
     config, env = run.config.universal, Labelled(game)
-    partners = load_population(run).known_partners
+    teachers = partners.teachers(run.env, run.config.partners, load_population(run))
     key = run.key(STAGE)
     state, returns = train_population(
         env,
         config.training,
-        lambda: universal.init_universal(env, config, key, partners),
+        lambda: universal.init_universal(env, config, key, teachers),
         universal.member_styles(env, config.seeds),
         Saver(run.path(stage, "unfinished")),
         task.update,
@@ -69,9 +69,9 @@ def load_universal(run: Run) -> dict[str, Player]:
 def load_universal_in(run: Run, game: Environment, stage: str) -> dict[str, Player]:
     """The same for the egos of `train_universal_in`."""
     config, env = run.config.universal, Labelled(game)
-    partners = load_population(run).known_partners
+    teachers = partners.teachers(run.env, run.config.partners, load_population(run))
     shapes = jax.eval_shape(
-        lambda key: universal.init_universal(env, config, key, partners), jax.random.key(0)
+        lambda key: universal.init_universal(env, config, key, teachers), jax.random.key(0)
     )
     like = Player(shapes.ego.actor, shapes.ego.critic)
     egos = checkpoint.restore(run.path(stage, "egos"), like)
