@@ -21,6 +21,10 @@ TRAINING_LENGTH = {
 """Factors on the joint training: in the crossway both players must learn to give way, and in
 `diverse_orders` to share the work in two rooms; Spread is learnt within 200,000 steps."""
 
+EXPLORATION = {"overcooked/diverse_orders": {"entropy": 0.04, "final_entropy": 0.005}}
+"""Weights of the joint training's entropy bonus where the usual ones are too small: in
+`diverse_orders` pairs otherwise keep to the nearer pot."""
+
 
 @dataclasses.dataclass(frozen=True)
 class CompressionConfig:
@@ -108,7 +112,11 @@ def _adapted(config: RunConfig) -> RunConfig:
     """Fits a preset to the kind of environment: length of games, size of rewards."""
     joint = config.partners.joint
     factor = TRAINING_LENGTH.get(config.environment, 1.0)
-    joint = dataclasses.replace(joint, total_steps=int(factor * joint.total_steps))
+    joint = dataclasses.replace(
+        joint,
+        total_steps=int(factor * joint.total_steps),
+        **EXPLORATION.get(config.environment, {}),
+    )
     config = dataclasses.replace(config, partners=dataclasses.replace(config.partners, joint=joint))
     if not config.environment.startswith("lbf/"):
         return config
