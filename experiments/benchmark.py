@@ -41,7 +41,21 @@ INSTALL_PEER = f"{PEER} is not installed; compare with it after: uv sync --group
 
 
 @dataclasses.dataclass(frozen=True)
-class EnvArguments:
+class _ContestArguments:
+    """What both contests of engines have in common."""
+
+    batch: int = 512
+    """Games played at once."""
+    repeats: int = 5
+    """Repeats of each; the fastest counts."""
+    cores: int = 2
+    """Cores to use."""
+    json: Annotated[Path | None, tyro.conf.arg(metavar="OUT")] = None
+    """Write the result as JSON too."""
+
+
+@dataclasses.dataclass(frozen=True)
+class EnvArguments(_ContestArguments):
     """Measure Overcooked with random actions, both players observed at every step.
 
     Ours with the feature vector and with the grid, and JaxMARL's (where it is installed) take
@@ -52,20 +66,12 @@ class EnvArguments:
 
     kitchens: tuple[str, ...] = KITCHENS
     """Classic kitchens to measure."""
-    batch: int = 512
-    """Games played at once."""
     steps: int = 1000
     """Steps of each game in one repeat; games last 400 steps and start again."""
-    repeats: int = 5
-    """Repeats of each; the fastest counts."""
-    cores: int = 2
-    """Cores to use."""
-    json: Annotated[Path | None, tyro.conf.arg(metavar="OUT")] = None
-    """Write the result as JSON too."""
 
 
 @dataclasses.dataclass(frozen=True)
-class LbfArguments:
+class LbfArguments(_ContestArguments):
     """Measure level-based foraging on random fields of 15 x 15 cells, two players, eight foods.
 
     Ours with each observation and Jumanji's with the same kind (where it is installed) take
@@ -76,16 +82,8 @@ class LbfArguments:
 
     encodings: tuple[str, ...] = tuple(contenders_lbf.ENCODINGS)
     """Our observations to measure."""
-    batch: int = 512
-    """Games played at once."""
     steps: int = 300
     """Steps of each game in one repeat; games last 100 steps and start again."""
-    repeats: int = 5
-    """Repeats of each; the fastest counts."""
-    cores: int = 2
-    """Cores to use."""
-    json: Annotated[Path | None, tyro.conf.arg(metavar="OUT")] = None
-    """Write the result as JSON too."""
 
 
 @dataclasses.dataclass(frozen=True)
