@@ -233,7 +233,7 @@ def overnight(environment: str, seed: int) -> RunConfig:
             held_out_seeds=3,
             spare_seeds=2,
             joint=PPOConfig(total_steps=1_200_000),
-            refit=best_response_config(900_000, num_envs=40),
+            refit=best_response_config(2_000_000, num_envs=40),
             oracle=oracle_config(200_000),
             oracle_candidates=2,
         ),

@@ -4,8 +4,8 @@
    out, and against those of other styles seen in a mirror (`best_response_refits`): an ego that
    knew one partner only keeps that partner's private conventions. The universal ego that is told
    the style (`haland_jax.universal`) is refitted too: it brings what it learnt with other styles.
-   Of the two starts each style keeps the one whose egos serve its training partners better
-   (`better_starts`). These egos are the archive.
+   Of the two starts each style keeps the one with the best ego, and of that start those that are
+   as good (`best_egos`). These egos are the archive.
 2. The Oracle of a held-out partner is the best of a few egos of its style refitted to that very
    partner (`oracle_refits`), chosen on other games than those it is scored on.
 """
@@ -25,10 +25,14 @@ from haland_jax.partners import (
     Population,
     flatten,
     repeat_styles,
+    take_seeds,
     teachers,
 )
 from haland_jax.population import over_population
 from haland_jax.ppo import PPOConfig, TrainState
+
+AS_GOOD = 0.97
+"""Share of the best ego's return from which another one counts as good."""
 
 
 def init_refits(
@@ -105,26 +109,30 @@ def best_response_refits(
     )
 
 
-def better_starts(egos: Player, returns: np.ndarray) -> tuple[Player, np.ndarray]:
-    """Keeps, for each style, the start whose refitted egos serve it better on average.
+def best_egos(egos: Player, returns: np.ndarray) -> tuple[Player, np.ndarray]:
+    """Keeps, for each style, the start that brought the best ego, and of it what is as good.
 
-    All egos of a style have the same start, so that they stay alike.
+    All egos of a style have the same start, so that they stay alike. One that learnt something
+    lesser and earns clearly less than the style's best (`AS_GOOD`) is no best response; a copy
+    of the best takes its place.
 
     Args:
         egos: refitted egos, leading axes [style, start * seed].
-        returns: mean return of each with the style's training partners, [style, start, seed].
+        returns: mean return of each with the style's partners, [style, start, seed].
 
     Returns:
-        The kept egos, leading axes [style, seed], and the kept start, int [style].
+        The kept egos, leading axes [style, seed], and their places among the given ones,
+        int [style, seed].
     """
-    styles, starts, seeds = returns.shape
-    best = returns.mean(axis=2).argmax(axis=1)
-
-    def keep(leaf: jax.Array) -> jax.Array:
-        by_start = leaf.reshape(styles, starts, seeds, *leaf.shape[2:])
-        return by_start[np.arange(styles), best]
-
-    return jax.tree.map(keep, egos), best
+    styles, _, seeds = returns.shape
+    best = returns.reshape(styles, -1).argmax(axis=1)
+    highest = returns.reshape(styles, -1).max(axis=1)
+    start = best // seeds
+    of_start = returns[np.arange(styles), start]
+    good = of_start >= (highest - (1 - AS_GOOD) * np.abs(highest))[:, None]
+    own_place = start[:, None] * seeds + np.arange(seeds)
+    kept = np.where(good, own_place, best[:, None])
+    return take_seeds(egos, kept), kept
 
 
 def oracle_refits(

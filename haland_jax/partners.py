@@ -86,7 +86,7 @@ class PartnersConfig:
     spare_seeds: int = 2
     joint: PPOConfig = dataclasses.field(default_factory=PPOConfig)
     refit: PPOConfig = dataclasses.field(
-        default_factory=lambda: best_response_config(900_000, num_envs=56)
+        default_factory=lambda: best_response_config(2_000_000, num_envs=56)
     )
     oracle: PPOConfig = dataclasses.field(default_factory=lambda: oracle_config(300_000))
     oracle_candidates: int = 3

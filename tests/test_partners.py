@@ -153,14 +153,19 @@ def test_the_universal_ego_is_refitted_beside_the_own_egos(game, population):
         np.testing.assert_array_equal(frozen, expected)
 
 
-def test_each_style_keeps_the_start_that_serves_it_better():
-    egos = Player({"bias": jnp.arange(8.0).reshape(2, 4)}, {"bias": jnp.zeros((2, 4, 3))})
-    returns = np.array([[[5.0, 6.0], [9.0, 1.0]], [[1.0, 1.0], [0.0, 3.0]]])
-    kept, best = best_responses.better_starts(egos, returns)
-    # Means: 5.5 against 5, and 1 against 1.5.
-    np.testing.assert_array_equal(best, [0, 1])
-    np.testing.assert_array_equal(kept.actor["bias"], [[0, 1], [6, 7]])
-    assert kept.critic["bias"].shape == (2, 2, 3)
+def test_each_style_keeps_the_start_with_the_best_ego_and_what_is_as_good():
+    egos = Player({"bias": jnp.arange(12.0).reshape(3, 4)}, {"bias": jnp.zeros((3, 4, 3))})
+    returns = np.array(
+        [
+            [[5.0, 6.0], [9.0, 1.0]],  # the second start's first ego; its second one is worse
+            [[300.0, 292.0], [290.0, 0.0]],  # both of the first start: 292 is 97.3% of 300
+            [[-50.0, -10.0], [-10.3, -9.9]],  # 3% of 9.9 below -9.9 is -10.197
+        ]
+    )
+    kept, places = best_responses.best_egos(egos, returns)
+    np.testing.assert_array_equal(places, [[2, 2], [0, 1], [3, 3]])
+    np.testing.assert_array_equal(kept.actor["bias"], [[2, 2], [4, 5], [11, 11]])
+    assert kept.critic["bias"].shape == (3, 2, 3)
 
 
 def test_refits_change_the_egos_and_leave_the_partners_alone(game, population):

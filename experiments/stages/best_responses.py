@@ -75,24 +75,27 @@ def _refit_egos(
     num_styles = len(env.style_names)
     egos = partners.unflatten(Player(refitted.ego.actor, refitted.ego.critic), num_styles)
 
-    each = jax.tree.map(lambda leaf: jnp.repeat(leaf, config.train_seeds, axis=1), egos.actor)
+    teachers = partners.teachers(env, config, population)
+    count = jax.tree.leaves(teachers)[0].shape[1]
+    each = jax.tree.map(lambda leaf: jnp.repeat(leaf, count, axis=1), egos.actor)
     everyone = jax.tree.map(
-        lambda leaf: jnp.tile(leaf, (1, times) + (1,) * (leaf.ndim - 2)),
-        population.train_partners,
+        lambda leaf: jnp.tile(leaf, (1, times) + (1,) * (leaf.ndim - 2)), teachers
     )
     returns = mean_returns(
         run,
         choice_key,
         partners.flatten(each),
         partners.flatten(everyone),
-        times * config.train_seeds,
-    ).reshape(num_styles, len(starts), config.train_seeds, config.train_seeds)
-    kept, best = best_responses.better_starts(egos, returns.mean(axis=3))
+        times * count,
+    ).reshape(num_styles, len(starts), config.train_seeds, count)
+    kept, places = best_responses.best_egos(egos, returns.mean(axis=3))
+    chosen = places[:, 0] // config.train_seeds
     return kept, {
-        "starts": {name: starts[i] for name, i in zip(env.style_names, best, strict=True)},
+        "starts": {name: starts[i] for name, i in zip(env.style_names, chosen, strict=True)},
         "start_returns": {
-            start: returns.mean(axis=(2, 3))[:, index] for index, start in enumerate(starts)
+            start: returns.mean(axis=3)[:, index] for index, start in enumerate(starts)
         },
+        "kept_egos": places % config.train_seeds,
     }
 
 
