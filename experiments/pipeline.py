@@ -80,7 +80,8 @@ def collect_results(run: Run) -> dict[str, Any]:
             for name in ("joint_returns", "kept_for_training", "kept_held_out")
         },
         "best_responses": {
-            name: metrics["best_responses"][name] for name in ("starts", "start_returns")
+            name: metrics["best_responses"][name]
+            for name in ("starts", "start_returns", "kept_egos")
         },
         "times": {name: values["seconds"] for name, values in metrics.items()},
         "machine": describe_machine(),

@@ -70,6 +70,9 @@ def test_results_hold_every_method_style_and_held_out_seed(results):
     starts = results["best_responses"]
     assert set(starts["starts"]) == set(styles)
     assert set(starts["starts"].values()) <= set(starts["start_returns"]) == {*STARTS}
+    assert np.shape(starts["kept_egos"]) == (8, config.train_seeds)
+    for returns in starts["start_returns"].values():
+        assert np.shape(returns) == (8, config.train_seeds)
     universal = results["universal"]
     assert universal["steps"] == 640
     for variant in VARIANTS:
