@@ -3,6 +3,8 @@
 Reference: `ForagingEnv._make_gym_obs` of lbforaging 2.0.0, with its agents' levels observed.
 """
 
+import functools
+
 import jax
 import jax.numpy as jnp
 import numpy as np
@@ -97,37 +99,35 @@ def grid(rules: Rules, state: State) -> jax.Array:
     entered; the player itself is in the centre, and what lies outside the field is 0. Two
     players on one cell show the level of the later one, as in the reference.
     """
+    # The barriers keep XLA on a CPU from computing what is small anew for every cell.
     barrier = jax.lax.optimization_barrier
-    reach, num_players = rules.reach, len(state.place)
-    side = 2 * reach + 1
-    in_window = np.arange(side) - reach
-    # Half as wide integers, where they are wide enough, are compared in half the time.
-    kind = jnp.int16 if side * side < 2**15 else jnp.int32
-    cells = np.arange(side * side, dtype=kind)
+    window = np.arange(2 * rules.reach + 1) - rules.reach
 
-    def window_cell(place: jax.Array) -> jax.Array:
-        """Which cell of each player's window a thing is on, -1 outside, [player, thing]."""
+    def bands(place: jax.Array, level: jax.Array) -> tuple[jax.Array, jax.Array]:
+        """Of each thing in each player's window: its row, all bits set, and its column, its level.
+
+        Where both are, their bitwise and is the level: int8 [player, thing, side] twice.
+        """
         away = place - state.place[:, None]
-        inside = jnp.all(jnp.abs(away) <= reach, axis=-1)
-        cell = jnp.where(inside, (away[..., 0] + reach) * side + away[..., 1] + reach, -1)
-        return cell.astype(kind)
+        row = -(away[..., :1] == window).astype(jnp.int8)
+        return row, jnp.where(away[..., 1:] == window, level[:, None], 0).astype(jnp.int8)
 
-    row, column = (state.place[:, axis, None] + in_window for axis in (0, 1))
-    row_inside = (row >= 0) & (row < rules.rows)
-    column_inside = (column >= 0) & (column < rules.columns)
-    # The barriers keep XLA on a CPU from computing what is small anew for every cell, and from
-    # choosing a layer at every cell.
-    there = jnp.where(state.food_level > 0, window_cell(state.food_place), -1)
-    small = (window_cell(state.place), there, state.level, state.food_level)
-    small = jax.tree.map(lambda part: part.astype(kind), (*small, row_inside, column_inside))
-    player_cell, food_cell, level, food_level, row_inside, column_inside = barrier(small)
-    players = foods = jnp.zeros((num_players, side * side), kind)
-    for index in range(num_players):
-        players = jnp.where(cells == player_cell[:, index, None], level[index], players)
-    for index in range(len(state.food_level)):
-        foods = jnp.where(cells == food_cell[:, index, None], food_level[index], foods)
-    field = (row_inside[:, :, None] * column_inside[:, None]).reshape(num_players, -1)
-    players, foods, field = barrier((players, foods, field))
-    free = barrier(jnp.where((players | foods) == 0, field, 0))
-    layers = jnp.stack([players, foods, free], axis=1).astype(jnp.int8)
-    return layers.reshape(num_players, 3, side, side)
+    def layer(row: jax.Array, column: jax.Array) -> jax.Array:
+        """All things in the window, which lie on different cells, int8 [player, side, side]."""
+        things = (row[:, k, :, None] & column[:, k, None, :] for k in range(row.shape[1]))
+        return functools.reduce(jnp.bitwise_or, things)
+
+    same_cell = jnp.all(state.place[:, None] == state.place, axis=-1)
+    covered = jnp.any(jnp.triu(same_cell, 1), axis=1)
+    small = (
+        *bands(state.place, jnp.where(covered, 0, state.level)),
+        *bands(state.food_place, state.food_level),
+    )
+    player_row, player_column, food_row, food_column = barrier(small)
+    players, foods = barrier((layer(player_row, player_column), layer(food_row, food_column)))
+    row, column = (state.place[:, axis, None] + window for axis in (0, 1))
+    row_inside = -((row >= 0) & (row < rules.rows)).astype(jnp.int8)
+    column_inside = ((column >= 0) & (column < rules.columns)).astype(jnp.int8)
+    row_inside, column_inside = barrier((row_inside, column_inside))
+    field = row_inside[:, :, None] & column_inside[:, None, :]
+    return jnp.stack([players, foods, jnp.where((players | foods) == 0, field, 0)], axis=1)
