@@ -119,12 +119,10 @@ def grid(rules: Rules, state: State) -> jax.Array:
 
     same_cell = jnp.all(state.place[:, None] == state.place, axis=-1)
     covered = jnp.any(jnp.triu(same_cell, 1), axis=1)
-    small = (
-        *bands(state.place, jnp.where(covered, 0, state.level)),
-        *bands(state.food_place, state.food_level),
-    )
-    player_row, player_column, food_row, food_column = barrier(small)
-    players, foods = barrier((layer(player_row, player_column), layer(food_row, food_column)))
+    of_players = bands(state.place, jnp.where(covered, 0, state.level))
+    of_foods = bands(state.food_place, state.food_level)
+    of_players, of_foods = barrier((of_players, of_foods))
+    players, foods = barrier((layer(*of_players), layer(*of_foods)))
     row, column = (state.place[:, axis, None] + window for axis in (0, 1))
     row_inside = -((row >= 0) & (row < rules.rows)).astype(jnp.int8)
     column_inside = ((column >= 0) & (column < rules.columns)).astype(jnp.int8)
