@@ -128,4 +128,5 @@ def grid(rules: Rules, state: State) -> jax.Array:
     column_inside = ((column >= 0) & (column < rules.columns)).astype(jnp.int8)
     row_inside, column_inside = barrier((row_inside, column_inside))
     field = row_inside[:, :, None] & column_inside[:, None, :]
-    return jnp.stack([players, foods, jnp.where((players | foods) == 0, field, 0)], axis=1)
+    free = field & jnp.equal(players | foods, 0).astype(jnp.int8)
+    return jnp.stack([players, foods, free], axis=1)
