@@ -80,7 +80,7 @@ class Overcooked:
         """Mirrors of the kitchen and its styles; none are known for the grid encoding."""
         if self.encoding == "grid":
             return ()
-        return find_symmetries(self.layout, self.styles, self.styles.task.shape[-1])
+        return find_symmetries(self.layout, self.styles)
 
     def style(self, name: str) -> Style:
         """Returns one style; ValueError for an unknown name."""

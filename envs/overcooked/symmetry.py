@@ -18,13 +18,12 @@ Place = Callable[[np.ndarray], np.ndarray]
 """From (x, y), int [..., 2], to where that is in the mirror."""
 
 
-def find_symmetries(layout: Layout, styles: Style, task_size: int) -> tuple[Symmetry, ...]:
+def find_symmetries(layout: Layout, styles: Style) -> tuple[Symmetry, ...]:
     """Returns every mirror, but the identity, that maps the kitchen and its styles to themselves.
 
     Args:
         layout: the kitchen.
         styles: all styles stacked, leading axis [style].
-        task_size: numbers of the task that ends the partner's feature vector.
     """
     corner = np.array([layout.width - 1, layout.height - 1])
     found = []
@@ -38,7 +37,9 @@ def find_symmetries(layout: Layout, styles: Style, task_size: int) -> tuple[Symm
         if mirror.keeps_the_kitchen:
             images = mirror.style_images(styles)
             if images is not None:
-                found.append(Symmetry(images, mirror.features(task_size), mirror.actions))
+                found.append(
+                    Symmetry(images, mirror.features(styles.task.shape[-1]), mirror.actions)
+                )
     return tuple(found)
 
 
@@ -46,13 +47,12 @@ class _Mirror:
     """One candidate: where each cell, station, item, feature and action is in the mirror."""
 
     def __init__(self, layout: Layout, image: Place, swap: bool):
-        self.layout, self.image, self.swap = layout, image, swap
-        letters = np.array([list(row) for row in layout.terrain])
-        if swap:
-            letters = _exchanged(letters, "O", "T")
-        y, x = np.indices(letters.shape)
+        self.layout, self.swap = layout, swap
+        terrain = np.array([list(row) for row in layout.terrain])
+        letters = _exchanged(terrain, "O", "T") if swap else terrain
+        y, x = np.indices(terrain.shape)
         image_x, image_y = np.moveaxis(image(np.stack([x, y], axis=-1)), -1, 0)
-        seen = np.array([list(row) for row in layout.terrain])[image_y, image_x]
+        seen = terrain[image_y, image_x]
         self.keeps_the_kitchen = bool((seen == letters).all()) and (not swap or layout.has_tomatoes)
         if self.keeps_the_kitchen:
             self.cells = _index_of(image(layout.floor), layout.floor)
@@ -88,11 +88,10 @@ class _Mirror:
     def features(self, task_size: int) -> np.ndarray:
         """Of each number of the partner's feature vector; int [O]."""
         layout = self.layout
-        swapped = layout.has_tomatoes and self.swap
         items = np.arange(6 if layout.has_tomatoes else 4)
         kinds = np.arange(len(STATION_KINDS) + 1)
         pot = np.arange(5)
-        if swapped:
+        if self.swap:
             items, pot = _exchanged(_exchanged(items, 0, 1), 4, 5), _exchanged(pot, 0, 1)
             kinds = _exchanged(kinds, layouts.ONIONS, layouts.TOMATOES)
         counters = self.stations[: layout.num_counters]
