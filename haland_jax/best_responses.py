@@ -98,11 +98,9 @@ def best_response_refits(
         times = 2 * times
     everyone = teachers(env, config, population)
     count = jax.tree.leaves(everyone)[0].shape[1]
-    if config.refit.num_envs % count:
-        raise ValueError(
-            f"partners.refit.num_envs is {config.refit.num_envs}; expected a multiple of the "
-            f"{count} partners of a style, mirror images included, which share the games"
-        )
+    ppo.expect_equal_shares(
+        "partners.refit", config.refit, count, "partners of a style, mirror images included"
+    )
     partners = jax.tree.map(lambda leaf: jnp.repeat(leaf[:, None], times, axis=1), everyone)
     return init_refits(
         env, config.refit, key, flatten(egos), flatten(partners), repeat_styles(env, times)

@@ -98,11 +98,7 @@ class PartnersConfig:
         for name in ("train_seeds", "held_out_seeds", "oracle_candidates", "evaluation_games"):
             if getattr(self, name) < 1:
                 raise ValueError(f"{name} is {getattr(self, name)}; expected at least 1")
-        if self.refit.num_envs % self.known_seeds:
-            raise ValueError(
-                f"refit.num_envs is {self.refit.num_envs}; expected a multiple of train_seeds + "
-                f"spare_seeds = {self.known_seeds}, since the partners share the games"
-            )
+        ppo.expect_equal_shares("refit", self.refit, self.known_seeds, "known partners of a style")
 
     @property
     def num_seeds(self) -> int:

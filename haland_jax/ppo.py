@@ -90,6 +90,25 @@ def learner_from(actor: Policy, critic: Any, config: PPOConfig) -> Learner:
     return Learner(actor, critic, make_optimizer(config).init((actor, critic)))
 
 
+def expect_equal_shares(name: str, config: PPOConfig, count: int, partners: str) -> None:
+    """Checks that frozen partners can share the games in equal parts.
+
+    Args:
+        name: of the settings, for the message.
+        config: the settings.
+        count: how many partners there are.
+        partners: what they are, for the message.
+
+    Raises:
+        ValueError: `config.num_envs` is no multiple of `count`.
+    """
+    if config.num_envs % count:
+        raise ValueError(
+            f"{name}.num_envs is {config.num_envs}; expected a multiple of {count}, the number "
+            f"of {partners}, who share the games"
+        )
+
+
 def init_train_state(
     env: Environment,
     config: PPOConfig,

@@ -91,11 +91,7 @@ def init_universal(
     everyone = flatten(partners)
     training = config.training
     count = jax.tree.leaves(everyone)[0].shape[0]
-    if training.num_envs % count:
-        raise ValueError(
-            f"universal.training.num_envs is {training.num_envs}; expected a multiple of the "
-            f"{count} partners, which share the games"
-        )
+    ppo.expect_equal_shares("universal.training", training, count, "partners of all styles")
 
     def init_ego(everyone: Policy, key: jax.Array, styles: StylesByGame) -> TrainState:
         learner_key, train_key = jax.random.split(key)
