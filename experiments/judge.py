@@ -42,16 +42,22 @@ class Judge:
         """
         styles, count = jax.tree.leaves(egos)[0].shape[:2]
         seeds = jax.tree.leaves(held_out)[0].shape[1]
-        flat_egos = jax.tree.map(
-            lambda leaf: jnp.repeat(leaf[:, None], seeds, axis=1).reshape(-1, *leaf.shape[2:]), egos
-        )
-        flat_partners = jax.tree.map(
-            lambda leaf: jnp.repeat(leaf, count, axis=1).reshape(-1, *leaf.shape[2:]), held_out
-        )
-        flat_styles = partners.repeat_styles(self.env, seeds * count)
-        returns = self.returns(key, flat_egos, flat_partners, flat_styles)
+        each_style = partners.repeat_styles(self.env, seeds * count)
+        returns = self.returns(key, *_all_pairs(egos, held_out), each_style)
         return returns.reshape(styles, seeds, count)
 
 
+@jax.jit
+def _all_pairs(egos: Policy, partners: Policy) -> tuple[Policy, Policy]:
+    """Each style's egos beside each of its partners, leading axis [style * seed * ego]."""
+    count = jax.tree.leaves(egos)[0].shape[1]
+    seeds = jax.tree.leaves(partners)[0].shape[1]
+    repeated = jax.tree.map(lambda leaf: jnp.repeat(leaf[:, None], seeds, axis=1), egos)
+    flat = jax.tree.map(lambda leaf: leaf.reshape(-1, *leaf.shape[3:]), repeated)
+    beside = jax.tree.map(lambda leaf: jnp.repeat(leaf, count, axis=1), partners)
+    return flat, jax.tree.map(lambda leaf: leaf.reshape(-1, *leaf.shape[2:]), beside)
+
+
+@jax.jit
 def _rows(tree: Any, rows: np.ndarray) -> Any:
     return jax.tree.map(lambda leaf: leaf[rows], tree)

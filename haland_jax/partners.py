@@ -178,7 +178,12 @@ def unflatten(tree: Any, num_styles: int) -> Any:
 
 def repeat_styles(env: Environment, times: int) -> Any:
     """Returns the style of each member, leading axis [style * times]."""
-    return jax.tree.map(lambda leaf: jnp.repeat(leaf, times, axis=0), env.styles)
+    return _repeat(env.styles, times)
+
+
+@partial(jax.jit, static_argnums=1)
+def _repeat(tree: Any, times: int) -> Any:
+    return jax.tree.map(lambda leaf: jnp.repeat(leaf, times, axis=0), tree)
 
 
 def init_pairs(env: Environment, config: PartnersConfig, key: jax.Array) -> TrainState:

@@ -34,9 +34,10 @@ def over_population(
         donate: positions of the arguments whose buffers may be overwritten.
 
     Returns:
-        A jitted function: shared arguments, then populations of the same size, to a
-        population. A population that the devices do not divide is filled up with copies of
-        its last member, which are dropped from the result.
+        A compiled function: shared arguments, then populations of the same size, to a
+        population. Where its arguments lie makes no difference: they are shared out first, since
+        every other placement would be another program. A population that the devices do not
+        divide is filled up with copies of its last member, which are dropped from the result.
     """
     devices = jax.devices()
     mesh = Mesh(np.array(devices), ("member",))
@@ -62,7 +63,14 @@ def over_population(
         result = sharded(*common, *own)
         return jax.tree.map(lambda leaf: leaf[:size], result) if missing else result
 
-    return jax.jit(call, donate_argnums=donate)
+    compiled = jax.jit(call, donate_argnums=donate)
+
+    def placed(*arguments: Any) -> Any:
+        common, own = arguments[:shared], arguments[shared:]
+        common = jax.device_put(common, NamedSharding(mesh, PartitionSpec()))
+        return compiled(*common, *map(share_out, own))
+
+    return placed
 
 
 def share_out(population: Population) -> Population:
