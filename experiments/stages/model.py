@@ -93,7 +93,10 @@ def init_vae(run: Run, key: jax.Array, policies: Policy) -> tuple[PolicyVAE, Any
 
 
 class Visits:
-    """States that policies visit in games with training partners; one compiled program."""
+    """States that policies visit in games with training partners; one compiled program.
+
+    Games are shared out over the devices; the states are for a fit, which has one.
+    """
 
     def __init__(self, run: Run, population: Population):
         self.run = run
@@ -118,7 +121,8 @@ class Visits:
         styles = partners.repeat_styles(env, times)
         styles = jax.tree.map(lambda leaf: jnp.roll(leaf, shift * times, axis=0), styles)
         keys = jax.random.split(key, len(env.style_names) * times)
-        return self._programs[number](keys, policies, partners.flatten(rolled), styles)
+        states = self._programs[number](keys, policies, partners.flatten(rolled), styles)
+        return jax.device_put(states, jax.devices()[0])
 
 
 def load_vae(run: Run) -> tuple[PolicyVAE, Any, policy_vae.Posterior]:
