@@ -15,15 +15,17 @@ DEFAULT_ENVIRONMENT = "overcooked/diverse_coordination"
 
 TRAINING_LENGTH = {
     "overcooked/crossway": 1.7,
-    "overcooked/diverse_orders": 2.0,
+    "overcooked/diverse_orders": 4.0,
     "lbf/spread": 0.4,
 }
 """Factors on the joint training: in the crossway both players must learn to give way, and in
 `diverse_orders` to share the work in two rooms; Spread is learnt within 200,000 steps."""
 
-EXPLORATION = {"overcooked/diverse_orders": {"entropy": 0.04, "final_entropy": 0.005}}
-"""Weights of the joint training's entropy bonus where the usual ones are too small: in
-`diverse_orders` pairs otherwise keep to the nearer pot."""
+JOINT_TRAINING = {
+    "overcooked/diverse_orders": {"entropy": 0.04, "final_entropy": 0.005, "discount": 0.995}
+}
+"""Settings of the joint training that differ: in `diverse_orders` pairs otherwise keep to the
+nearer pot. The farther one pays some fifty steps after the first ingredient is put into it."""
 
 
 @dataclasses.dataclass(frozen=True)
@@ -115,7 +117,7 @@ def _adapted(config: RunConfig) -> RunConfig:
     joint = dataclasses.replace(
         joint,
         total_steps=int(factor * joint.total_steps),
-        **EXPLORATION.get(config.environment, {}),
+        **JOINT_TRAINING.get(config.environment, {}),
     )
     config = dataclasses.replace(config, partners=dataclasses.replace(config.partners, joint=joint))
     if not config.environment.startswith("lbf/"):

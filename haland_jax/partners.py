@@ -166,11 +166,15 @@ class Population(PyTreeNode):
         return take_seeds(self.egos, self.held_out_index)
 
 
+@jax.jit
+@jax.jit
 def flatten(tree: Any) -> Any:
     """Merges the leading axes [style, seed] into [member]."""
     return jax.tree.map(lambda leaf: leaf.reshape(-1, *leaf.shape[2:]), tree)
 
 
+@partial(jax.jit, static_argnums=1)
+@partial(jax.jit, static_argnums=1)
 def unflatten(tree: Any, num_styles: int) -> Any:
     """Splits the leading axis [member] into [style, seed]."""
     return jax.tree.map(lambda leaf: leaf.reshape(num_styles, -1, *leaf.shape[1:]), tree)
@@ -255,6 +259,7 @@ def select_seeds(
     return kept[:, sorted(train)].astype(np.int32), kept[:, held_out].astype(np.int32)
 
 
+@jax.jit
 def take_seeds(tree: Any, index: np.ndarray | jax.Array) -> Any:
     """Picks seeds by style: leaves [style, seed, ...], index [style, n] -> [style, n, ...]."""
     rows = np.arange(index.shape[0])[:, None]

@@ -117,12 +117,16 @@ class Visits:
             self._programs[number] = over_population(
                 partial(partners.visited_observations, env, num_games=VISIT_GAMES, num_kept=number)
             )
-        rolled = jax.tree.map(lambda leaf: jnp.roll(leaf, shift, axis=0), self.partners)
-        styles = partners.repeat_styles(env, times)
-        styles = jax.tree.map(lambda leaf: jnp.roll(leaf, shift * times, axis=0), styles)
+        others = _rolled(partners.flatten(self.partners), shift * times)
+        styles = _rolled(partners.repeat_styles(env, times), shift * times)
         keys = jax.random.split(key, len(env.style_names) * times)
-        states = self._programs[number](keys, policies, partners.flatten(rolled), styles)
+        states = self._programs[number](keys, policies, others, styles)
         return jax.device_put(states, jax.devices()[0])
+
+
+@jax.jit
+def _rolled(tree: Any, places: int) -> Any:
+    return jax.tree.map(lambda leaf: jnp.roll(leaf, places, axis=0), tree)
 
 
 def load_vae(run: Run) -> tuple[PolicyVAE, Any, policy_vae.Posterior]:
