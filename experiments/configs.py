@@ -1,7 +1,8 @@
 """The presets: everything that a run depends on, as frozen dataclasses."""
 
 import dataclasses
-from collections.abc import Callable
+from collections.abc import Callable, Mapping
+from typing import Any
 
 from haland_jax.diffusion import DiffusionConfig
 from haland_jax.fit import FitConfig
@@ -13,19 +14,38 @@ from haland_jax.universal import UniversalConfig, universal_config
 
 DEFAULT_ENVIRONMENT = "overcooked/diverse_coordination"
 
-TRAINING_LENGTH = {
-    "overcooked/crossway": 1.7,
-    "overcooked/diverse_orders": 4.0,
-    "lbf/spread": 0.4,
-}
-"""Factors on the joint training: in the crossway both players must learn to give way, and in
-`diverse_orders` to share the work in two rooms; Spread is learnt within 200,000 steps."""
 
-JOINT_TRAINING = {
-    "overcooked/diverse_orders": {"entropy": 0.04, "final_entropy": 0.005, "discount": 0.995}
+@dataclasses.dataclass(frozen=True)
+class Adaptation:
+    """How the presets change for an environment.
+
+    Attributes:
+        max_steps: steps of a game.
+        length: factor on the steps of the joint training.
+        joint: settings of the joint training that differ.
+        training: settings of every training that differ.
+    """
+
+    max_steps: int = 400
+    length: float = 1.0
+    joint: Mapping[str, Any] = dataclasses.field(default_factory=dict)
+    training: Mapping[str, Any] = dataclasses.field(default_factory=dict)
+
+
+ADAPTATIONS = {
+    # Both players must learn to give way.
+    "overcooked/crossway": Adaptation(length=1.7),
+    # Pairs must learn to share the work in two rooms, and otherwise keep to the nearer pot: the
+    # farther one pays some fifty steps after the first ingredient is put into it.
+    "overcooked/diverse_orders": Adaptation(
+        length=4.0, joint={"entropy": 0.04, "final_entropy": 0.005, "discount": 0.995}
+    ),
+    # Learnt within 200,000 steps; the target pays 1 where a soup pays 20.
+    "lbf/spread": Adaptation(
+        max_steps=50, length=0.4, training={"reward_scale": 2.0, "confined_until": 0.0}
+    ),
 }
-"""Settings of the joint training that differ: in `diverse_orders` pairs otherwise keep to the
-nearer pot. The farther one pays some fifty steps after the first ingredient is put into it."""
+"""Environments that need other settings than the presets'."""
 
 
 @dataclasses.dataclass(frozen=True)
@@ -111,35 +131,24 @@ class RunConfig:
 
 
 def _adapted(config: RunConfig) -> RunConfig:
-    """Fits a preset to the kind of environment: length of games, size of rewards."""
-    joint = config.partners.joint
-    factor = TRAINING_LENGTH.get(config.environment, 1.0)
-    joint = dataclasses.replace(
-        joint,
-        total_steps=int(factor * joint.total_steps),
-        **JOINT_TRAINING.get(config.environment, {}),
-    )
-    config = dataclasses.replace(config, partners=dataclasses.replace(config.partners, joint=joint))
-    if not config.environment.startswith("lbf/"):
-        return config
+    """Fits a preset to its environment."""
+    change = ADAPTATIONS.get(config.environment, Adaptation())
 
-    def rescaled(training: PPOConfig) -> PPOConfig:
-        # The target pays 1 where a soup pays 20.
-        return dataclasses.replace(training, reward_scale=2.0, confined_until=0.0)
+    def changed(training: PPOConfig, **more: Any) -> PPOConfig:
+        return dataclasses.replace(training, **change.training, **more)
 
-    partners = config.partners
+    partners, universal = config.partners, config.universal
+    steps = int(change.length * partners.joint.total_steps)
     return dataclasses.replace(
         config,
-        max_steps=50,
+        max_steps=min(config.max_steps, change.max_steps),
         partners=dataclasses.replace(
             partners,
-            joint=rescaled(partners.joint),
-            refit=rescaled(partners.refit),
-            oracle=rescaled(partners.oracle),
+            joint=changed(partners.joint, total_steps=steps, **change.joint),
+            refit=changed(partners.refit),
+            oracle=changed(partners.oracle),
         ),
-        universal=dataclasses.replace(
-            config.universal, training=rescaled(config.universal.training)
-        ),
+        universal=dataclasses.replace(universal, training=changed(universal.training)),
     )
 
 
