@@ -42,8 +42,9 @@ class Judge:
         """
         styles, count = jax.tree.leaves(egos)[0].shape[:2]
         seeds = jax.tree.leaves(held_out)[0].shape[1]
+        flat_egos, flat_partners = _all_pairs(egos, held_out)
         each_style = partners.repeat_styles(self.env, seeds * count)
-        returns = self.returns(key, *_all_pairs(egos, held_out), each_style)
+        returns = self.returns(key, flat_egos, flat_partners, each_style)
         return returns.reshape(styles, seeds, count)
 
 
