@@ -98,7 +98,9 @@ class PartnersConfig:
         for name in ("train_seeds", "held_out_seeds", "oracle_candidates", "evaluation_games"):
             if getattr(self, name) < 1:
                 raise ValueError(f"{name} is {getattr(self, name)}; expected at least 1")
-        ppo.expect_equal_shares("refit", self.refit, self.known_seeds, "known partners of a style")
+        ppo.expect_equal_shares(
+            "refit", self.refit, self.known_seeds, "partners of train_seeds + spare_seeds"
+        )
 
     @property
     def num_seeds(self) -> int:
@@ -167,13 +169,11 @@ class Population(PyTreeNode):
 
 
 @jax.jit
-@jax.jit
 def flatten(tree: Any) -> Any:
     """Merges the leading axes [style, seed] into [member]."""
     return jax.tree.map(lambda leaf: leaf.reshape(-1, *leaf.shape[2:]), tree)
 
 
-@partial(jax.jit, static_argnums=1)
 @partial(jax.jit, static_argnums=1)
 def unflatten(tree: Any, num_styles: int) -> Any:
     """Splits the leading axis [member] into [style, seed]."""

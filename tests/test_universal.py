@@ -183,7 +183,7 @@ def test_a_folded_label_values_as_the_told_critic():
 
 def test_partners_that_cannot_share_the_games_are_refused():
     env, config = Labelled(ToyGame()), UniversalConfig(training=TINY)
-    with pytest.raises(ValueError, match="is 8; expected a multiple of 6"):
+    with pytest.raises(ValueError, match="is 8; expected a multiple of 6, the number of partners"):
         universal.init_universal(
             env, config, jax.random.key(0), frozen_partners([[0, 1, 0], [1, 0, 1]])
         )
