@@ -152,6 +152,10 @@ def _adapted(config: RunConfig) -> RunConfig:
     )
 
 
+_DIFFUSION = DiffusionConfig(clip=8.0, frequency_jitter=0.08)
+"""What all presets but `smoke` sample and train with; they differ in the length of the fit."""
+
+
 def smoke(environment: str, seed: int) -> RunConfig:
     """Every stage at toy size, to see that all of it works; nothing is learnt.
 
@@ -223,7 +227,7 @@ def quick(environment: str, seed: int) -> RunConfig:
         compression=CompressionConfig(
             fit=FitConfig(learning_rate=1e-2, steps=1500, warmup_steps=50)
         ),
-        diffusion=DiffusionConfig(clip=8.0, frequency_jitter=0.08),
+        diffusion=_DIFFUSION,
         universal=UniversalConfig(training=universal_config(1_500_000)),
     )
     return _adapted(config)
@@ -251,9 +255,8 @@ def overnight(environment: str, seed: int) -> RunConfig:
         compression=CompressionConfig(
             fit=FitConfig(learning_rate=5e-3, steps=5000, warmup_steps=100)
         ),
-        diffusion=DiffusionConfig(
-            clip=8.0,
-            frequency_jitter=0.08,
+        diffusion=dataclasses.replace(
+            _DIFFUSION,
             fit=FitConfig(learning_rate=2e-3, steps=4000, warmup_steps=200, ema_decay=0.999),
         ),
         universal=UniversalConfig(training=universal_config(10_000_000, num_envs=240)),
@@ -275,9 +278,8 @@ def paper(environment: str, seed: int) -> RunConfig:
         compression=CompressionConfig(
             fit=FitConfig(learning_rate=5e-3, steps=10_000, warmup_steps=200)
         ),
-        diffusion=DiffusionConfig(
-            clip=8.0,
-            frequency_jitter=0.08,
+        diffusion=dataclasses.replace(
+            _DIFFUSION,
             fit=FitConfig(learning_rate=2e-3, steps=10_000, warmup_steps=200, ema_decay=0.999),
         ),
         universal=UniversalConfig(
