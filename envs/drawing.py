@@ -375,7 +375,7 @@ def _draw_box(pencil: ImageDraw.ImageDraw, shape: Rect | Ellipse) -> None:
 def _draw_line(pencil: ImageDraw.ImageDraw, line: Line) -> None:
     colour = _rgba(line.stroke, line.opacity)
     pencil.line(line.points, fill=colour, width=max(1, round(line.width)), joint="curve")
-    if line.opacity < 1:
+    if line.opacity < 1 or line.width < 1:  # a cap thinner than a pixel has no box to fill
         return
     radius = line.width / 2
     for x, y in (line.points[0], line.points[-1]):

@@ -216,6 +216,14 @@ def test_pictures_are_deterministic_and_scale(kitchen, state):
         viewer.to_image(picture, 0)
 
 
+@pytest.mark.parametrize("scale", [0.05, 0.2, 1.0])
+def test_lines_thinner_than_a_pixel_are_drawn(scale):
+    across = drawing.Line(((2.0, 10.0), (18.0, 10.0)), stroke="#ff0000", width=0.8)
+    paper = drawing.Panel(0, 0, 20, 20, (across,))
+    image = viewer.to_image(drawing.Scene(20, 20, "#ffffff", (paper,)), scale)
+    assert (np.asarray(image) != 255).any()
+
+
 def test_png_and_svg_files_hold_the_picture(tmp_path, kitchen, state):
     picture = viewer.draw_state(kitchen, state)
     viewer.save_png(tmp_path / "a.png", picture)
