@@ -74,11 +74,11 @@ def _divergence(
     first, _ = before.haland.generate_from_task_language(language, noise)
     second, _ = after.haland.generate_from_task_language(language_after, noise)
     env = before.env
-    held_out = jax.tree.map(lambda leaf: leaf[styles, 0], before.held_out_partners)
+    held_out = jax.tree.map(lambda leaf: leaf[styles, :1], before.held_out_partners)
     visit = jax.jit(
         jax.vmap(
             lambda key, ego, partner, style: partners.visited_observations(
-                env, key, ego, partner, style, num_games=1, num_kept=STATES
+                env, key, ego, partner, style, num_kept=STATES
             )
         )
     )

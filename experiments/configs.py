@@ -22,12 +22,14 @@ class Adaptation:
     Attributes:
         max_steps: steps of a game.
         length: factor on the steps of the joint training.
+        refit_length: factor on the steps of the best responses' refits.
         joint: settings of the joint training that differ.
         training: settings of every training that differ.
     """
 
     max_steps: int = 400
     length: float = 1.0
+    refit_length: float = 1.0
     joint: Mapping[str, Any] = dataclasses.field(default_factory=dict)
     training: Mapping[str, Any] = dataclasses.field(default_factory=dict)
 
@@ -38,7 +40,10 @@ ADAPTATIONS = {
     # Pairs must learn to share the work in two rooms, and otherwise keep to the nearer pot: the
     # farther one pays some fifty steps after the first ingredient is put into it.
     "overcooked/diverse_orders": Adaptation(
-        length=4.0, joint={"entropy": 0.04, "final_entropy": 0.005, "discount": 0.995}
+        length=4.0,
+        refit_length=2.0,
+        joint={"entropy": 0.04, "final_entropy": 0.005},
+        training={"discount": 0.995},
     ),
     # Learnt within 200,000 steps; the target pays 1 where a soup pays 20.
     "lbf/spread": Adaptation(
@@ -134,18 +139,18 @@ def _adapted(config: RunConfig) -> RunConfig:
     """Fits a preset to its environment."""
     change = ADAPTATIONS.get(config.environment, Adaptation())
 
-    def changed(training: PPOConfig, **more: Any) -> PPOConfig:
-        return dataclasses.replace(training, **change.training, **more)
+    def changed(training: PPOConfig, length: float = 1.0, **more: Any) -> PPOConfig:
+        steps = int(length * training.total_steps)
+        return dataclasses.replace(training, total_steps=steps, **change.training, **more)
 
     partners, universal = config.partners, config.universal
-    steps = int(change.length * partners.joint.total_steps)
     return dataclasses.replace(
         config,
         max_steps=min(config.max_steps, change.max_steps),
         partners=dataclasses.replace(
             partners,
-            joint=changed(partners.joint, total_steps=steps, **change.joint),
-            refit=changed(partners.refit),
+            joint=changed(partners.joint, change.length, **change.joint),
+            refit=changed(partners.refit, change.refit_length),
             oracle=changed(partners.oracle),
         ),
         universal=dataclasses.replace(universal, training=changed(universal.training)),

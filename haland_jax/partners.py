@@ -329,22 +329,28 @@ def visited_observations(
     env: Environment,
     key: jax.Array,
     ego: Policy,
-    partner: Policy,
+    partners: Policy,
     style: Any,
     *,
-    num_games: int,
     num_kept: int,
 ) -> jax.Array:
-    """Returns observations of the ego in games with a partner, drawn at random, [num_kept, O].
+    """Returns observations of the ego in games with partners, drawn at random, [num_kept, O].
 
     Half of the games go on from a random moment, so that the observations cover more than what
-    this one partner leads to. Observations after a game's end are never drawn.
+    these partners lead to. Observations after a game's end are never drawn.
+
+    Args:
+        env: the environment.
+        key: consumed.
+        ego: parameters of the ego's actor.
+        partners: actors of the partners, leading axis [game]; there is one game with each.
+        style: the partners' style.
+        num_kept: observations to draw, with replacement.
     """
     game_key, draw_key = jax.random.split(key)
     record = partial(rollout.record, env, random_share=0.5)
-    games = jax.vmap(lambda k: record(k, ego, partner, style))(
-        jax.random.split(game_key, num_games)
-    )
+    keys = jax.random.split(game_key, jax.tree.leaves(partners)[0].shape[0])
+    games = jax.vmap(lambda k, partner: record(k, ego, partner, style))(keys, partners)
     observations = games.observations.ego.reshape(-1, games.observations.ego.shape[-1])
     alive = games.alive.reshape(-1).astype(jnp.float32)
     drawn = jax.random.choice(draw_key, alive.shape[0], (num_kept,), p=alive / jnp.sum(alive))

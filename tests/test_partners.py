@@ -220,9 +220,8 @@ def test_visited_observations_are_of_games_that_are_on(game):
             game,
             key,
             always(1, 3, 3),
-            always(0, 2, 4),
+            jax.tree.map(lambda leaf: jnp.stack(4 * [leaf]), always(0, 2, 4)),
             game.style("short"),
-            num_games=4,
             num_kept=200,
         )
     )(jax.random.key(0))

@@ -30,8 +30,6 @@ from haland_jax.partners import Population
 from haland_jax.policy_vae import PolicyVAE
 from haland_jax.population import over_population
 
-VISIT_GAMES = 4
-
 
 def fit_policy_vae(run: Run, task: StageProgress) -> dict[str, Any]:
     """Stage 3: compresses the archive; states of decoded policies join as the fit goes on."""
@@ -93,40 +91,43 @@ def init_vae(run: Run, key: jax.Array, policies: Policy) -> tuple[PolicyVAE, Any
 
 
 class Visits:
-    """States that policies visit in games with training partners; one compiled program.
+    """States that policies visit in games with each partner that egos learn with.
 
     Games are shared out over the devices; the states are for a fit, which has one.
     """
 
     def __init__(self, run: Run, population: Population):
         self.run = run
-        self.partners = population.train_partners
+        self.teachers = partners.teachers(run.env, run.config.partners, population)
         self._programs: dict[int, Any] = {}
 
     def own_partners(self, key: jax.Array, policies: Policy, number: int) -> jax.Array:
-        """States of each policy [member] with its own partner, [member, number, O]."""
+        """States of each policy [member] with partners of its style, [member, number, O]."""
         return self._visit(key, policies, number, shift=0)
 
     def other_partners(self, key: jax.Array, policies: Policy, number: int) -> jax.Array:
-        """States of each policy with a partner of another style, [member, number, O]."""
+        """States of each policy with partners of another style, [member, number, O]."""
         return self._visit(key, policies, number, shift=1)
 
     def _visit(self, key: jax.Array, policies: Policy, number: int, shift: int) -> jax.Array:
         env, times = self.run.env, self.run.config.partners.train_seeds
         if number not in self._programs:
             self._programs[number] = over_population(
-                partial(partners.visited_observations, env, num_games=VISIT_GAMES, num_kept=number)
+                partial(partners.visited_observations, env, num_kept=number)
             )
-        others = _rolled(partners.flatten(self.partners), shift * times)
-        styles = _rolled(partners.repeat_styles(env, times), shift * times)
+        others = _for_each_policy(self.teachers, times, shift)
+        styles = _for_each_policy(env.styles, times, shift)
         keys = jax.random.split(key, len(env.style_names) * times)
         states = self._programs[number](keys, policies, others, styles)
         return jax.device_put(states, jax.devices()[0])
 
 
-@jax.jit
-def _rolled(tree: Any, places: int) -> Any:
-    return jax.tree.map(lambda leaf: jnp.roll(leaf, places, axis=0), tree)
+@partial(jax.jit, static_argnums=(1, 2))
+def _for_each_policy(by_style: Any, times: int, shift: int) -> Any:
+    """What belongs to the style `shift` places before that of each policy [style * times]."""
+    return jax.tree.map(
+        lambda leaf: jnp.repeat(jnp.roll(leaf, shift, axis=0), times, axis=0), by_style
+    )
 
 
 def load_vae(run: Run) -> tuple[PolicyVAE, Any, policy_vae.Posterior]:
