@@ -61,7 +61,8 @@ class CompressionConfig:
         vae: sizes and loss (Table 2).
         fit: optimiser and length.
         chunk_steps: steps between two refreshes of the states; divides `fit.steps`.
-        own_states: states of each policy from its games with its own training partners.
+        own_states: states of each policy from games with the partners that egos of its style
+            learn with.
         other_states: states from games with partners of other styles.
         decoded_states: states from games of the *decoded* policy, labelled by the original;
             they stop small errors from adding up along a game (DAgger, Ross et al., 2011).
@@ -241,8 +242,8 @@ def quick(environment: str, seed: int) -> RunConfig:
 def overnight(environment: str, seed: int) -> RunConfig:
     """The scale of the recorded results: three training and three held-out seeds a style.
 
-    `python -m experiments.run --preset overnight --env all`; about three quarters of an hour
-    for each environment on two CPU cores.
+    `python -m experiments.run --preset overnight --env all`; four hours on two CPU cores, from
+    half an hour (`lbf/spread`) to an hour and a half (`overcooked/diverse_orders`).
     """
     config = RunConfig(
         environment=environment,

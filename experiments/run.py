@@ -40,7 +40,7 @@ class Arguments:
     or all."""
     preset: Annotated[str, tyro.conf.arg(metavar="NAME")] = "quick"
     """Scale: smoke (two minutes, learns nothing), quick (a quarter of an hour on two cores),
-    overnight (three training and three held-out seeds a style; three quarters of an hour),
+    overnight (three training and three held-out seeds a style; an hour or so),
     paper (five and five; hours)."""
     seed: int = 0
     """Seed of all randomness; the same seed gives the same results."""
