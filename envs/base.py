@@ -85,6 +85,12 @@ class Environment(Protocol):
     event_names: tuple[str, ...]
     """Names of the events of one player, in the order of `TimeStep.events`' last axis."""
     num_actions: Pair
+    continuous: bool
+    """Whether an action is a vector of `num_actions` numbers from -1 to 1, not one of as many."""
+    compiler_options: dict[str, Any]
+    """What XLA must be told to compile programs with this environment well; see `jax.jit`."""
+    success_event: str | None
+    """The event that happens once in a game that succeeds; None where games only earn a return."""
     observation_sizes: Pair
     max_steps: int
     symmetries: tuple[Symmetry, ...]

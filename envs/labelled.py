@@ -46,6 +46,9 @@ class Labelled:
         self.observation_sizes = Pair(ego + count, partner)
         self.max_steps = env.max_steps
         self.symmetries = env.symmetries
+        self.continuous = env.continuous
+        self.compiler_options = env.compiler_options
+        self.success_event = env.success_event
         self.task_language_source: Literal["events", "labels"] = env.task_language_source
 
     def style(self, name: str) -> LabelledStyle:

@@ -8,9 +8,18 @@ from envs.lbf.env import make_lbf
 from envs.overcooked.env import make_overcooked
 from envs.overcooked.layouts import CLASSIC, STYLED
 
+
+def _make_assistive(robot: str, **options: Any) -> Any:
+    # MuJoCo and MJX take seconds to import, which those who cook need not wait for.
+    from envs.assistive.env import make_assistive
+
+    return make_assistive(robot, **options)
+
+
 _FAMILIES: dict[str, tuple[tuple[str, ...], Callable[..., Any]]] = {
     "overcooked": (STYLED + CLASSIC, make_overcooked),
     "lbf": (("spread",), make_lbf),
+    "assistive": (("jaco",), _make_assistive),
 }
 
 

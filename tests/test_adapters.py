@@ -6,6 +6,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
+from toy_reach import ToyReach
 
 from envs import registry
 from envs.adapters.jaxmarl import JaxMARLEnvironment
@@ -110,6 +111,8 @@ def test_jaxmarl_draws_only_the_wanted_styles(environment):
     _, states = jax.vmap(two.reset)(jax.random.split(jax.random.key(1), 64))
     drawn = {environment.style_names[int(index)] for index in states.style}
     assert drawn == {"onion_2", "tomato_4"}
+    with pytest.raises(ValueError, match=r"toy_reach has continuous actions; expected .* discrete"):
+        JaxMARLEnvironment(ToyReach())
     with pytest.raises(ValueError, match="expected one or more of"):
         JaxMARLEnvironment(environment, ["soup_9"])
     with pytest.raises(ValueError, match="expected one or more of"):
@@ -236,6 +239,8 @@ def test_pettingzoo_refuses_wrong_arguments(environment, parallel):
         parallel.reset(options={"style": "nobody"})
     with pytest.raises(ValueError, match="render_mode"):
         PettingZooEnvironment(environment, render_mode="human")
+    with pytest.raises(ValueError, match=r"toy_reach has continuous actions; expected .* discrete"):
+        PettingZooEnvironment(ToyReach())
     with pytest.raises(ValueError, match="expected one or more of"):
         PettingZooEnvironment(environment, [])
     assert PettingZooEnvironment(environment).render() is None

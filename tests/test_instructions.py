@@ -22,6 +22,18 @@ KITCHENS = {
 LEVELS = tuple(f"level_{level}" for level in range(1, 9))
 STYLES = {f"overcooked/{kitchen}": styles for kitchen, styles in KITCHENS.items()}
 STYLES |= {"lbf/spread": LEVELS}
+STYLES |= {
+    "assistive/jaco": (
+        "scratch_upper_arm",
+        "scratch_forearm",
+        "bathe_down",
+        "bathe_up",
+        "feed_left",
+        "feed_right",
+        "drink_left",
+        "drink_right",
+    )
+}
 NUMBERS = ("one", "two", "three", "four", "five", "six", "seven", "eight")
 ORDINALS = ("first", "second", "third", "fourth", "fifth", "sixth", "seventh", "eighth")
 SMALL = ("smallest", "lightest", "lowest")

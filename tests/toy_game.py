@@ -1,7 +1,7 @@
 """A game of a few steps whose every reward can be foretold."""
 
 import dataclasses
-from typing import ClassVar, Literal, NamedTuple
+from typing import Any, ClassVar, Literal, NamedTuple
 
 import jax
 import jax.numpy as jnp
@@ -43,6 +43,9 @@ class ToyGame:
     max_steps: int = 5
     num_actions: ClassVar[Pair] = Pair(3, 2)
     observation_sizes: ClassVar[Pair] = Pair(3, 4)
+    continuous: ClassVar[bool] = False
+    compiler_options: ClassVar[dict[str, Any]] = {}
+    success_event: ClassVar[str | None] = None
     symmetries: ClassVar[tuple[Symmetry, ...]] = ()
     task_language_source: ClassVar[Literal["events", "labels"]] = "events"
 

@@ -2,4 +2,5 @@
 
 from envs.adapters.jaxmarl import JaxMARLEnvironment
 from envs.adapters.pettingzoo import PettingZooEnvironment
+from envs.adapters.brax import BraxEnvironment
 """

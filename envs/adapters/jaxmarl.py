@@ -85,10 +85,15 @@ class JaxMARLEnvironment:
         style_names: styles to draw from; all of the environment's by default.
 
     Raises:
-        ValueError: no style, or an unknown one.
+        ValueError: continuous actions, no style, or an unknown one.
     """
 
     def __init__(self, environment: Environment, style_names: Sequence[str] | None = None):
+        if environment.continuous:
+            raise ValueError(
+                f"{environment.name} has continuous actions; expected an environment with discrete "
+                "ones, such as overcooked/crossway; see envs.adapters.brax"
+            )
         chosen = environment.style_names if style_names is None else tuple(style_names)
         unknown = [name for name in chosen if name not in environment.style_names]
         if unknown or not chosen:

@@ -34,7 +34,8 @@ class PettingZooEnvironment(ParallelEnv[str, np.ndarray, int]):
             `viewer` does.
 
     Raises:
-        ValueError: no style, an unknown style, an unknown render mode, or no `frame_fn` for it.
+        ValueError: continuous actions, no style, an unknown style, an unknown render mode, or no
+            `frame_fn` for it.
     """
 
     def __init__(
@@ -45,6 +46,11 @@ class PettingZooEnvironment(ParallelEnv[str, np.ndarray, int]):
         render_mode: str | None = None,
         frame_fn: FrameFn | None = None,
     ):
+        if environment.continuous:
+            raise ValueError(
+                f"{environment.name} has continuous actions; expected an environment with discrete "
+                "ones, such as overcooked/crossway; see envs.adapters.brax"
+            )
         chosen = environment.style_names if style_names is None else tuple(style_names)
         unknown = [name for name in chosen if name not in environment.style_names]
         if unknown or not chosen:

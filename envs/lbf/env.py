@@ -40,6 +40,9 @@ class Spread:
     rows: ClassVar[int] = spread.SIZE
     columns: ClassVar[int] = spread.SIZE
     symmetries: ClassVar[tuple[Symmetry, ...]] = ()
+    continuous: ClassVar[bool] = False
+    compiler_options: ClassVar[dict[str, Any]] = {}
+    success_event: ClassVar[str | None] = None
     task_language_source: ClassVar[Literal["events", "labels"]] = "labels"
 
     def __post_init__(self):

@@ -3,7 +3,7 @@
 import dataclasses
 import functools
 from types import ModuleType
-from typing import ClassVar, Literal
+from typing import Any, ClassVar, Literal
 
 import jax
 import jax.numpy as jnp
@@ -39,6 +39,9 @@ class Overcooked:
     shaping: Literal["guided", "reference"] = "guided"
     partner_sight: int | None = None
     weights: ShapingWeights = dataclasses.field(default_factory=ShapingWeights)
+    continuous: ClassVar[bool] = False
+    compiler_options: ClassVar[dict[str, Any]] = {}
+    success_event: ClassVar[str | None] = None
     task_language_source: ClassVar[Literal["events", "labels"]] = "events"
 
     def __post_init__(self):
