@@ -18,6 +18,7 @@ import numpy as np
 
 from envs.base import Environment
 from haland_jax import ppo
+from haland_jax.learner import TrainState
 from haland_jax.networks import Policy
 from haland_jax.partners import (
     PartnersConfig,
@@ -29,7 +30,7 @@ from haland_jax.partners import (
     teachers,
 )
 from haland_jax.population import over_population
-from haland_jax.ppo import PPOConfig, TrainState
+from haland_jax.ppo import PPOConfig
 
 AS_GOOD = 0.97
 """Share of the best ego's return from which another one counts as good."""
@@ -55,11 +56,13 @@ def init_refits(
     """
 
     def init_refit(key, ego, partners, style):
-        learner = ppo.learner_from(ego.actor, ego.critic, config)
+        learner = ego.learner(config)
         return ppo.init_train_state(env, config, key, learner, partners, style)
 
     keys = jax.random.split(key, jax.tree.leaves(styles)[0].shape[0])
-    return over_population(init_refit)(keys, egos, partners, styles)
+    return over_population(init_refit, compiler_options=env.compiler_options)(
+        keys, egos, partners, styles
+    )
 
 
 def best_response_refits(

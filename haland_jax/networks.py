@@ -121,6 +121,11 @@ def fold_normalisation(policy: Policy, mean: Array, std: Array) -> Policy:
     return {**policy, "params": {**policy["params"], "dense_0": folded}}
 
 
+def unfold_normalisation(policy: Policy, mean: Array, std: Array) -> Policy:
+    """The policy that reads (observation - mean) / std as `policy` reads raw observations."""
+    return fold_normalisation(policy, -mean / std, 1.0 / std)
+
+
 def sample(key: Array, distribution: Distribution) -> Array:
     """Draw an action: int32 [...] from logits [..., A], or float [..., A] from a `Gaussian`."""
     if isinstance(distribution, Gaussian):

@@ -17,11 +17,13 @@ import jax.numpy as jnp
 import numpy as np
 from flax.struct import PyTreeNode
 
-from envs.base import Environment, Symmetry
-from haland_jax import ppo, rollout
+from envs.base import Environment, Pair, Symmetry
+from haland_jax import normalisation, ppo, rollout
+from haland_jax.learner import Learner, TrainState, init_learner, learner_from, make_networks
 from haland_jax.networks import Policy, layer_names
+from haland_jax.normalisation import Normaliser
 from haland_jax.population import over_population
-from haland_jax.ppo import PPOConfig, TrainState
+from haland_jax.ppo import PPOConfig
 
 
 def best_response_config(total_steps: int, num_envs: int = 32) -> PPOConfig:
@@ -114,10 +116,47 @@ class PartnersConfig:
 
 
 class Player(PyTreeNode):
-    """What is kept of a learner: its actor, and its critic for later refits."""
+    """What is kept of a learner; both networks read raw observations.
+
+    Attributes:
+        actor: the policy.
+        critic: for later refits.
+        normaliser: with which it learnt, for later refits; None if it read raw observations.
+    """
 
     actor: Policy
     critic: Any
+    normaliser: Normaliser | None = None
+
+    @classmethod
+    def of(cls, learners: Learner) -> "Player":
+        """What is kept of learners with leading axis [member]."""
+
+        def keep(learner: Learner) -> Player:
+            actor, critic = (
+                normalisation.fold(learner.normaliser, network)
+                for network in (learner.actor, learner.critic)
+            )
+            return cls(actor, critic, learner.normaliser)
+
+        return jax.vmap(keep)(learners)
+
+    def learner(self, config: PPOConfig) -> Learner:
+        """A learner that goes on from one player."""
+        return learner_from(self.actor, self.critic, config, self.normaliser)
+
+
+def trained_players(state: TrainState) -> Pair:
+    """What is kept of trained pairs, leading axis [member]: a `Player` each, None if frozen.
+
+    A learner's own networks read normalised observations; nobody should play with those.
+    """
+    return Pair(
+        *(
+            Player.of(learner) if isinstance(learner, Learner) else None
+            for learner in (state.ego, state.partner)
+        )
+    )
 
 
 class Population(PyTreeNode):
@@ -190,7 +229,7 @@ def _repeat(tree: Any, times: int) -> Any:
     return jax.tree.map(lambda leaf: jnp.repeat(leaf, times, axis=0), tree)
 
 
-def init_pairs(env: Environment, config: PartnersConfig, key: jax.Array) -> TrainState:
+def init_pairs(env: Environment, config: PPOConfig, num_seeds: int, key: jax.Array) -> TrainState:
     """Starts partner and ego of every style and seed.
 
     All egos start from the same parameters: policies that share their initialisation are
@@ -198,39 +237,43 @@ def init_pairs(env: Environment, config: PartnersConfig, key: jax.Array) -> Trai
 
     Args:
         env: the environment.
-        config: how many seeds.
+        config: settings of their training.
+        num_seeds: pairs of each style.
         key: consumed.
 
     Returns:
         Training states with leading axis [style * num_seeds].
     """
     ego_key, pair_key = jax.random.split(key)
-    actors, critic = ppo.make_networks(env)
+    actors, critic = make_networks(env)
     sizes = env.observation_sizes
-    styles = repeat_styles(env, config.num_seeds)
+    styles = repeat_styles(env, num_seeds)
 
     def init_pair(ego_key, pair_key, style):
         partner_key, train_key = jax.random.split(pair_key)
-        ego = ppo.init_learner(ego_key, actors.ego, critic, sizes.ego, config.joint)
-        partner = ppo.init_learner(partner_key, actors.partner, critic, sizes.partner, config.joint)
-        return ppo.init_train_state(env, config.joint, train_key, ego, partner, style)
+        ego = init_learner(ego_key, actors.ego, critic, sizes.ego, config)
+        partner = init_learner(partner_key, actors.partner, critic, sizes.partner, config)
+        return ppo.init_train_state(env, config, train_key, ego, partner, style)
 
-    keys = jax.random.split(pair_key, len(env.style_names) * config.num_seeds)
-    return over_population(init_pair, shared=1)(ego_key, keys, styles)
+    keys = jax.random.split(pair_key, len(env.style_names) * num_seeds)
+    start = over_population(init_pair, shared=1, compiler_options=env.compiler_options)
+    return start(ego_key, keys, styles)
 
 
 def compile_training(
     env: Environment, config: PPOConfig, num_updates: int
 ) -> Callable[[TrainState, Any], tuple[TrainState, dict[str, jax.Array]]]:
     """Compiles `ppo.train_chunk` for a population; the given state is consumed."""
-    return over_population(partial(ppo.train_chunk, env, config, num_updates), donate=(0,))
+    chunk = partial(ppo.train_chunk, env, config, num_updates)
+    return over_population(chunk, donate=(0,), compiler_options=env.compiler_options)
 
 
 def compile_evaluation(
     env: Environment, num_games: int
 ) -> Callable[[jax.Array, Policy, Policy, Any], rollout.Games]:
     """Compiles the evaluation of pairs: keys, egos, partners, styles [member] -> `Games`."""
-    return over_population(partial(rollout.play, env, num_games=num_games))
+    play = partial(rollout.play, env, num_games=num_games)
+    return over_population(play, compiler_options=env.compiler_options)
 
 
 def select_seeds(
@@ -304,21 +347,21 @@ def _seen_in(mirror: Symmetry, policies: Policy) -> Policy:
 
 
 def make_population(
-    env: Environment, config: PartnersConfig, state: TrainState, returns: np.ndarray
+    env: Environment, config: PartnersConfig, players: Pair, returns: np.ndarray
 ) -> Population:
     """Says which pairs train and which are held out, by `select_seeds`.
 
     Args:
         env: the environment.
         config: how many.
-        state: the trained pairs, leading axis [style * num_seeds].
+        players: the trained pairs, leading axis [style * num_seeds].
         returns: mean return of each pair, [style, num_seeds].
     """
     num_styles = len(env.style_names)
     train, held_out = select_seeds(returns, config.train_seeds, config.held_out_seeds)
     return Population(
-        partners=unflatten(state.partner.actor, num_styles),
-        egos=unflatten(Player(state.ego.actor, state.ego.critic), num_styles),
+        partners=unflatten(players.partner.actor, num_styles),
+        egos=unflatten(players.ego, num_styles),
         joint_returns=jnp.asarray(returns),
         train_index=jnp.asarray(train),
         held_out_index=jnp.asarray(held_out),

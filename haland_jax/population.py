@@ -11,6 +11,7 @@ from typing import Any
 import jax
 import jax.numpy as jnp
 import numpy as np
+from jax.core import Tracer
 from jax.sharding import Mesh, NamedSharding, PartitionSpec
 
 Population = Any
@@ -23,7 +24,11 @@ def population_size(population: Population) -> int:
 
 
 def over_population(
-    function: Callable[..., Any], *, shared: int = 0, donate: tuple[int, ...] = ()
+    function: Callable[..., Any],
+    *,
+    shared: int = 0,
+    donate: tuple[int, ...] = (),
+    compiler_options: dict[str, Any] | None = None,
 ) -> Callable[..., Any]:
     """Compiles a function of one member into one of a population.
 
@@ -32,6 +37,7 @@ def over_population(
             of one member.
         shared: how many leading arguments are shared.
         donate: positions of the arguments whose buffers may be overwritten.
+        compiler_options: see `jax.jit`.
 
     Returns:
         A compiled function: shared arguments, then populations of the same size, to a
@@ -63,9 +69,11 @@ def over_population(
         result = sharded(*common, *own)
         return jax.tree.map(lambda leaf: leaf[:size], result) if missing else result
 
-    compiled = jax.jit(call, donate_argnums=donate)
+    compiled = jax.jit(call, donate_argnums=donate, compiler_options=compiler_options)
 
     def placed(*arguments: Any) -> Any:
+        if any(isinstance(leaf, Tracer) for leaf in jax.tree.leaves(arguments)):
+            return call(*arguments)  # a part of another program, which has its own options
         common, own = arguments[:shared], arguments[shared:]
         common = jax.device_put(common, NamedSharding(mesh, PartitionSpec()))
         return compiled(*common, *map(share_out, own))

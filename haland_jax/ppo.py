@@ -13,81 +13,18 @@ from typing import Any
 
 import jax
 import jax.numpy as jnp
-import optax
-from flax.struct import PyTreeNode
 
 from envs.base import Environment, Pair
-from haland_jax import networks
+from haland_jax import networks, normalisation
+from haland_jax.learner import (
+    Learner,
+    StylesByGame,
+    TrainState,
+    make_networks,
+    make_optimizer,
+)
 from haland_jax.networks import MLPActor, MLPCritic, Policy
 from haland_jax.ppo_loss import Batch, PPOConfig, generalised_advantages, ppo_loss
-
-
-class Learner(PyTreeNode):
-    """A player that learns: parameters of its actor and critic, and the optimiser's state."""
-
-    actor: Policy
-    critic: Any
-    optimizer_state: Any
-
-
-class TrainState(PyTreeNode):
-    """Everything that training one pair needs to go on.
-
-    Attributes:
-        update: updates done, int32 [].
-        key: never consumed; folded with `update`.
-        ego: the ego's learner.
-        partner: the partner's learner, or frozen actors with leading axis [partner].
-        env_states: states of the games, leading axis [env].
-        observations: `Pair` of [env, O].
-    """
-
-    update: jax.Array
-    key: jax.Array
-    ego: Learner
-    partner: Learner | Policy
-    env_states: Any
-    observations: Pair
-
-
-class StylesByGame(PyTreeNode):
-    """Styles that share the games of one ego, in equal parts and in this order.
-
-    The frozen partners of such games are in the order of their styles, equally many of each.
-
-    Attributes:
-        styles: leading axis [style].
-    """
-
-    styles: Any
-
-
-def make_networks(env: Environment) -> tuple[Pair, MLPCritic]:
-    """Returns the actors of both players and the critic that either uses."""
-    return Pair(*(MLPActor(actions) for actions in env.num_actions)), MLPCritic()
-
-
-def make_optimizer(config: PPOConfig) -> optax.GradientTransformation:
-    """Adam on clipped gradients; the learning rate is applied by the caller."""
-    return optax.chain(
-        optax.clip_by_global_norm(config.max_gradient_norm), optax.scale_by_adam(eps=1e-5)
-    )
-
-
-def init_learner(
-    key: jax.Array, actor: MLPActor, critic: MLPCritic, size: int, config: PPOConfig
-) -> Learner:
-    """Returns a fresh learner for observations of a size; consumes `key`."""
-    actor_key, critic_key = jax.random.split(key)
-    observation = jnp.zeros(size)
-    return learner_from(
-        actor.init(actor_key, observation), critic.init(critic_key, observation), config
-    )
-
-
-def learner_from(actor: Policy, critic: Any, config: PPOConfig) -> Learner:
-    """Returns a learner that starts from given parameters."""
-    return Learner(actor, critic, make_optimizer(config).init((actor, critic)))
 
 
 def expect_equal_shares(name: str, config: PPOConfig, count: int, partners: str) -> None:
@@ -187,11 +124,17 @@ def _update(
         if not isinstance(learner, Learner):
             continue
         actor = actors[agent]
+        rewards = scaled[agent]
+        if config.bootstrap_truncated:
+            rewards += config.discount * steps["cut_off"][agent]
         batch = _make_batch(
-            config, critic, learner, steps, state.observations[agent], agent, scaled[agent]
+            config, critic, learner, steps, state.observations[agent], agent, rewards
         )
         strided = isinstance(style, StylesByGame) or not isinstance(state.partner, Learner)
         learner, loss = _learn(config, actor, critic, learner, batch, strided=strided, **rates)
+        if learner.normaliser is not None:
+            seen = normalisation.update(learner.normaliser, steps["observations"][agent])
+            learner = learner.replace(normaliser=seen)
         state = state.replace(**{role: learner})
         losses.append(loss)
     by_rule = jnp.any(steps["terminated"])
@@ -245,12 +188,13 @@ def _rollout(
     random_share: jax.Array,
 ) -> tuple[TrainState, dict[str, Any]]:
     """Plays `rollout_steps` steps of all games; finished games start anew."""
-    actors, _ = make_networks(env)
-    ego = partial(actors.ego.apply, state.ego.actor)
+    actors, critic = make_networks(env)
+    ego = partial(_distribution, actors.ego, state.ego)
     if isinstance(state.partner, Learner):
-        partner = partial(actors.partner.apply, state.partner.actor)
+        partner = partial(_distribution, actors.partner, state.partner)
     else:
         partner = partial(_frozen_partners, actors.partner, config.partner_noise, state.partner)
+    players = (state.ego, state.partner)
     play = _over_games(lambda style, key, game, actions: env.step(key, game, actions, style), style)
     restart_all = _over_games(_restart(env, random_share), style)
 
@@ -262,7 +206,7 @@ def _rollout(
             networks.sample(ego_key, distributions.ego),
             networks.sample(partner_key, distributions.partner),
         )
-        log_probs = jax.tree.map(networks.log_prob, distributions, actions)
+        log_probs = Pair(*map(networks.log_prob, distributions, actions))
         keys = jax.random.split(env_key, config.num_envs)
         following, timesteps = play(keys, states, actions)
         fresh, first = restart_all(jax.random.split(reset_key, config.num_envs))
@@ -280,6 +224,13 @@ def _rollout(
             "ended": done,
             "terminated": timesteps.terminated,
         }
+        if config.bootstrap_truncated:
+            kept["cut_off"] = Pair(
+                *(
+                    timesteps.truncated * _value(critic, learner, seen)
+                    for learner, seen in zip(players, timesteps.observation, strict=True)
+                )
+            )
         states = jax.tree.map(restart, fresh, following)
         observations = jax.tree.map(restart, first.observation, timesteps.observation)
         return (states, observations), kept
@@ -289,6 +240,20 @@ def _rollout(
         one_step, carry, jax.random.split(key, config.rollout_steps)
     )
     return state.replace(env_states=env_states, observations=observations), steps
+
+
+def _distribution(actor: MLPActor, learner: Learner, observation: jax.Array) -> Any:
+    """What a learner does on raw observations [env, O]."""
+    return actor.apply(learner.actor, normalisation.normalise(learner.normaliser, observation))
+
+
+def _value(critic: MLPCritic, player: Learner | Policy, observation: jax.Array) -> jax.Array:
+    """What a learner expects of raw observations [env, O]; nothing for frozen partners."""
+    if not isinstance(player, Learner):
+        return jnp.zeros(())
+    seen = normalisation.normalise(player.normaliser, observation)
+    value: Any = critic.apply(player.critic, seen)
+    return value
 
 
 def _frozen_partners(
@@ -312,14 +277,14 @@ def _make_batch(
     rewards: jax.Array,
 ) -> Batch:
     """Values and advantages of one player's experience."""
-    observation = steps["observations"][agent]
-    everything = jnp.concatenate([observation, last_observation[None]])
+    everything = jnp.concatenate([steps["observations"][agent], last_observation[None]])
+    everything = normalisation.normalise(learner.normaliser, everything)
     values = critic.apply(learner.critic, everything)
     advantage = generalised_advantages(
         rewards, values[:-1], values[-1], steps["ended"], config.discount, config.gae_lambda
     )
     return Batch(
-        observation=observation,
+        observation=everything[:-1],
         action=steps["actions"][agent],
         log_prob=steps["log_probs"][agent],
         value=values[:-1],
@@ -370,4 +335,7 @@ def _learn(
     carry = ((learner.actor, learner.critic), learner.optimizer_state)
     order = jnp.tile(jnp.arange(config.num_minibatches), config.epochs)
     ((actor_params, critic_params), optimizer_state), losses = jax.lax.scan(one_step, carry, order)
-    return Learner(actor_params, critic_params, optimizer_state), jnp.mean(losses)
+    learner = learner.replace(
+        actor=actor_params, critic=critic_params, optimizer_state=optimizer_state
+    )
+    return learner, jnp.mean(losses)

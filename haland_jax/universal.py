@@ -17,10 +17,11 @@ import jax.numpy as jnp
 
 from envs.labelled import Labelled
 from haland_jax import ppo
+from haland_jax.learner import StylesByGame, TrainState, init_learner, make_networks
 from haland_jax.networks import Policy
 from haland_jax.partners import Player, flatten
 from haland_jax.population import over_population
-from haland_jax.ppo import PPOConfig, StylesByGame, TrainState
+from haland_jax.ppo import PPOConfig
 
 TOLD_NOTHING, TOLD_THE_STYLE = "told nothing", "told the style"
 VARIANTS = (TOLD_NOTHING, TOLD_THE_STYLE)
@@ -87,7 +88,7 @@ def init_universal(
     Raises:
         ValueError: the partners cannot share the games in equal parts.
     """
-    actors, critic = ppo.make_networks(env)
+    actors, critic = make_networks(env)
     everyone = flatten(partners)
     training = config.training
     count = jax.tree.leaves(everyone)[0].shape[0]
@@ -96,11 +97,12 @@ def init_universal(
     def init_ego(everyone: Policy, key: jax.Array, styles: StylesByGame) -> TrainState:
         learner_key, train_key = jax.random.split(key)
         size = env.observation_sizes.ego
-        ego = ppo.init_learner(learner_key, actors.ego, critic, size, training)
+        ego = init_learner(learner_key, actors.ego, critic, size, training)
         return ppo.init_train_state(env, training, train_key, ego, everyone, styles)
 
     keys = jnp.tile(jax.random.split(key, config.seeds), len(VARIANTS))
-    return over_population(init_ego, shared=1)(everyone, keys, member_styles(env, config.seeds))
+    start = over_population(init_ego, shared=1, compiler_options=env.compiler_options)
+    return start(everyone, keys, member_styles(env, config.seeds))
 
 
 def fold_label(params: Any, label: jax.Array) -> Any:
@@ -136,7 +138,13 @@ def players_by_style(env: Labelled, egos: Player) -> dict[str, Player]:
     )
 
     def fold(ego: Player, label: jax.Array) -> Player:
-        return Player(fold_label(ego.actor, label), fold_label(ego.critic, label))
+        normaliser = ego.normaliser
+        if normaliser is not None:
+            rest = normaliser.mean.shape[0] - label.shape[0]
+            normaliser = normaliser.replace(
+                mean=normaliser.mean[:rest], variance=normaliser.variance[:rest]
+            )
+        return Player(fold_label(ego.actor, label), fold_label(ego.critic, label), normaliser)
 
     over_seeds = jax.vmap(fold, in_axes=(0, None))
     over_styles = jax.vmap(over_seeds, in_axes=(None, 0))

@@ -36,7 +36,7 @@ def game():
 
 @pytest.fixture(scope="module")
 def pairs(game):
-    return partners.init_pairs(game, CONFIG, jax.random.key(0))
+    return partners.init_pairs(game, CONFIG.joint, CONFIG.num_seeds, jax.random.key(0))
 
 
 @pytest.fixture(scope="module")
@@ -47,7 +47,7 @@ def population(game, pairs):
         lambda leaf: leaf + marks.reshape(-1, *[1] * (leaf.ndim - 1)), pairs.ego.actor
     )
     pairs = pairs.replace(ego=pairs.ego.replace(actor=marked))
-    return partners.make_population(game, CONFIG, pairs, RETURNS)
+    return partners.make_population(game, CONFIG, partners.trained_players(pairs), RETURNS)
 
 
 def mark(actor) -> np.ndarray:

@@ -11,6 +11,7 @@ from toy_game import ToyGame, always
 
 import envs
 from haland_jax import ppo
+from haland_jax.learner import init_learner, make_networks
 from haland_jax.networks import MLPActor, MLPCritic
 from haland_jax.ppo import PPOConfig
 from haland_jax.ppo_loss import Batch, generalised_advantages, ppo_loss
@@ -22,11 +23,11 @@ TINY = PPOConfig(
 
 def fresh_pair(game, config, frozen=None):
     """The state of one pair that begins to learn; `frozen` partners do not."""
-    actors, critic = ppo.make_networks(game)
+    actors, critic = make_networks(game)
     sizes = game.observation_sizes
     ego_key, partner_key, key = jax.random.split(jax.random.key(0), 3)
-    ego = ppo.init_learner(ego_key, actors.ego, critic, sizes.ego, config)
-    partner = ppo.init_learner(partner_key, actors.partner, critic, sizes.partner, config)
+    ego = init_learner(ego_key, actors.ego, critic, sizes.ego, config)
+    partner = init_learner(partner_key, actors.partner, critic, sizes.partner, config)
     if frozen is not None:
         partner = frozen
     return ppo.init_train_state(game, config, key, ego, partner, game.style("long"))
@@ -244,10 +245,10 @@ def test_a_pair_learns_to_cook_in_the_cramped_room():
 
 
 def fresh_pair_in(env, config):
-    actors, critic = ppo.make_networks(env)
+    actors, critic = make_networks(env)
     keys = jax.random.split(jax.random.key(0), 3)
     learners = [
-        ppo.init_learner(key, actor, critic, size, config)
+        init_learner(key, actor, critic, size, config)
         for key, actor, size in zip(keys, actors, env.observation_sizes, strict=False)
     ]
     return ppo.init_train_state(env, config, keys[2], *learners, env.style("free"))

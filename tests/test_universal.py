@@ -13,8 +13,9 @@ from envs.base import Pair
 from envs.labelled import Labelled, LabelledStyle
 from experiments import configs, training
 from haland_jax import networks, partners, ppo, rollout, universal
+from haland_jax.learner import StylesByGame, init_learner, learner_from, make_networks
 from haland_jax.partners import Player
-from haland_jax.ppo import PPOConfig, StylesByGame
+from haland_jax.ppo import PPOConfig
 from haland_jax.universal import UniversalConfig
 
 TINY = PPOConfig(
@@ -111,8 +112,8 @@ def test_each_game_has_its_partners_style():
 def test_a_style_for_all_games_and_the_same_style_by_game_play_alike():
     game = ToyGame(ego_weight=1.0)
     twice = jax.tree.map(lambda leaf: jnp.stack([leaf, leaf]), game.style("long"))
-    actors, critic = ppo.make_networks(game)
-    ego = ppo.init_learner(jax.random.key(0), actors.ego, critic, 3, TINY)
+    actors, critic = make_networks(game)
+    ego = init_learner(jax.random.key(0), actors.ego, critic, 3, TINY)
     frozen = partners.flatten(frozen_partners([[0], [1]]))
     found = []
     for style in (game.style("long"), StylesByGame(twice)):
@@ -133,7 +134,7 @@ def test_a_minibatch_has_games_of_all_styles(monkeypatch):
     monkeypatch.setattr(ppo, "ppo_loss", watched_loss)
     leaf = jnp.broadcast_to(jnp.arange(8.0), (5, 8))
     batch = ppo.Batch(leaf, leaf, leaf, leaf, leaf, leaf)
-    learner = ppo.learner_from({"w": jnp.zeros(2)}, {"w": jnp.zeros(2)}, TINY)
+    learner = learner_from({"w": jnp.zeros(2)}, {"w": jnp.zeros(2)}, TINY)
     for strided in (False, True):
         learn = partial(ppo._learn, TINY, None, None, learner, batch, strided=strided)
         jax.block_until_ready(learn(learning_rate=jnp.ones(()), entropy_weight=jnp.ones(())))
@@ -220,7 +221,7 @@ def test_the_told_ego_learns_what_the_other_cannot():
     frozen = frozen_partners([[0], [1]])
     state = universal.init_universal(env, config, jax.random.key(0), frozen)
     state, _ = train(env, config, state, config.training.num_updates)
-    by_style = universal.players_by_style(env, Player(state.ego.actor, state.ego.critic))
+    by_style = universal.players_by_style(env, Player.of(state.ego))
     assert tuple(by_style) == universal.VARIANTS
     shares = {}
     for variant, players in by_style.items():
