@@ -6,7 +6,7 @@ the last but one axis runs over, along which a layer sums): an entry is off by a
 and biases, take next to no space and stay float32.
 """
 
-from collections.abc import Mapping
+from collections.abc import Container, Mapping
 from typing import Any
 
 import numpy as np
@@ -17,11 +17,12 @@ _CODES, _STEP = ":codes", ":step"
 _HIGHEST_CODE = 127
 
 
-def pack(tree: Mapping[str, Any]) -> dict[str, np.ndarray]:
+def pack(tree: Mapping[str, Any], exact: Container[str] = ()) -> dict[str, np.ndarray]:
     """The arrays to store, by flat name such as "decoder/dense_0/kernel".
 
     Args:
         tree: nested dictionaries of float32 arrays; no key contains "/" or ":".
+        exact: keys of the outermost dictionary whose arrays stay float32.
 
     Raises:
         ValueError: an array is not float32, not finite, or too large for half precision.
@@ -34,7 +35,9 @@ def pack(tree: Mapping[str, Any]) -> dict[str, np.ndarray]:
             raise ValueError(f"'{name}' is {array.dtype}; expected float32")
         if not np.isfinite(array).all():
             raise ValueError(f"'{name}' has entries that are not finite; check the training")
-        if array.size >= LARGE and array.ndim > 1:
+        if name.split("/")[0] in exact:
+            packed[name] = array
+        elif array.size >= LARGE and array.ndim > 1:
             packed[name + _CODES], packed[name + _STEP] = _codes(array)
         elif array.size >= SMALL:
             if np.abs(array).max() > np.finfo(np.float16).max:

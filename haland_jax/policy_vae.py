@@ -13,11 +13,14 @@ import jax
 import jax.numpy as jnp
 from jax import Array
 
-from haland_jax import networks
+from haland_jax import networks, normalisation
 from haland_jax.hypernetwork import GraphHypernetwork, HypernetworkConfig, PolicyArchitecture
 from haland_jax.networks import DistributionKind, Policy
 
 Params = Any
+
+STATISTICS = "statistics"
+"""The collection beside "params" that holds the observations' mean and deviation."""
 
 
 @dataclass(frozen=True)
@@ -31,7 +34,9 @@ class PolicyVAEConfig:
     deviation over the drawn policies, so that policies survive a perturbation (method stage 3's
     gate asks for 0.1); `initial_posterior_std`, small beside the latents, so that they are heard
     from the first step; `policies_per_step` (all, if there are fewer) and `states_per_policy`, the
-    size of a minibatch. The hypernetwork's deviations are stated in `HypernetworkConfig`.
+    size of a minibatch; `normalised`, whether encoder and decoder see policies as they read
+    normalised observations (`with_statistics`), for observations in several units. The
+    hypernetwork's deviations are stated in `HypernetworkConfig`.
 
     Raises:
         ValueError: if a size is not positive or a scale is negative.
@@ -44,6 +49,7 @@ class PolicyVAEConfig:
     initial_posterior_std: float = 0.05
     policies_per_step: int = 64
     states_per_policy: int = 256
+    normalised: bool = False
     hypernetwork: HypernetworkConfig = field(default_factory=HypernetworkConfig)
 
     def __post_init__(self) -> None:
@@ -135,6 +141,11 @@ class PolicyVAE(nn.Module):
 
     Written for one policy; callers vmap `vae.apply(params, x, method="encode")` (or "decode").
     Calling the module reconstructs a policy through its posterior mean, without noise.
+
+    Policies read raw observations. If `config.normalised`, encoder and decoder see them as they
+    read normalised ones: where a number varies by a centimetre, the weights of a raw policy are
+    a hundred times larger than its others, and a decoder's errors in them as much worse. The
+    statistics are a collection of their own beside the parameters and get no gradient.
     """
 
     architecture: PolicyArchitecture
@@ -143,17 +154,38 @@ class PolicyVAE(nn.Module):
     def setup(self) -> None:
         self.encoder = PolicyEncoder(self.architecture, self.config)
         self.decoder = GraphHypernetwork(self.architecture, self.config.hypernetwork)
+        if self.config.normalised:
+            size = self.architecture.observation_dim
+            self.mean = self.variable(STATISTICS, "mean", jnp.zeros, size)
+            self.std = self.variable(STATISTICS, "std", jnp.ones, size)
 
     def __call__(self, policy: Policy) -> Policy:
         return self.decode(self.encode(policy).mean)
 
     def encode(self, policy: Policy) -> Posterior:
         """Mean and log-variance of z, [D] each."""
+        if self.config.normalised:
+            policy = networks.unfold_normalisation(policy, *self._statistics)
         return self.encoder(policy)
 
     def decode(self, latent: Array) -> Policy:
         """The policy of z [D], with the pytree structure of `architecture`."""
-        return self.decoder(latent)
+        policy = self.decoder(latent)
+        if self.config.normalised:
+            policy = networks.fold_normalisation(policy, *self._statistics)
+        return policy
+
+    @property
+    def _statistics(self) -> tuple[Array, Array]:
+        return jax.lax.stop_gradient((self.mean.value, self.std.value))
+
+
+def with_statistics(params: Params, states: Array) -> Params:
+    """The parameters with the statistics of states [..., O], if they hold any; else as they are."""
+    if STATISTICS not in params:
+        return params
+    seen = normalisation.update(normalisation.fresh(states.shape[-1]), states)
+    return {**params, STATISTICS: {"mean": seen.mean, "std": seen.std}}
 
 
 class PolicyBatch(NamedTuple):

@@ -29,7 +29,7 @@ from flax import traverse_util
 from safetensors import SafetensorError
 
 import envs
-from haland_jax import bert_weights, compact
+from haland_jax import bert_weights, compact, policy_vae
 from haland_jax.bert_weights import Encoder
 from haland_jax.checkpoint import CheckpointError
 from haland_jax.configuration import filled
@@ -143,7 +143,12 @@ def write(
         "oracles": model.oracles["params"],
         "language": {"v_hat": haland.v_hat, "scale": model.event_scale},
     }
-    packed = compact.pack(parts)
+    exact = ()
+    if policy_vae.STATISTICS in haland.vae_params:
+        parts["observations"] = haland.vae_params[policy_vae.STATISTICS]
+        # Where a number hardly varies, their weights are a hundred times larger than the others.
+        exact = ("held_out_partners", "oracles")
+    packed = compact.pack(parts, exact)
     folder.mkdir(parents=True, exist_ok=True)
     safetensors.numpy.save_file(packed, folder / ARRAYS)
     configuration = {
@@ -197,11 +202,14 @@ def read(folder: Path) -> TrainedModel:
             f"{source or 'the packaged one'}, which is installed here; install that version, or "
             "train again"
         )
+    vae_params = {"params": {"decoder": parts["decoder"]}}
+    if "observations" in parts:
+        vae_params[policy_vae.STATISTICS] = parts["observations"]
     statistics = LatentStatistics(parts["latents"]["mean"], parts["latents"]["std"])
     haland = Haland(
         architecture=architecture,
         vae_config=vae_config,
-        vae_params={"params": {"decoder": parts["decoder"]}},
+        vae_params=vae_params,
         diffusion_config=diffusion_config,
         diffusion_params=DiffusionParams({"params": parts["diffusion"]}, statistics),
         translator=Translator(

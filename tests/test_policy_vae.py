@@ -193,6 +193,67 @@ def test_three_policies_are_reconstructed_also_from_perturbed_latents(kind):
         assert divergence(key, 0.1).max() < 0.02
 
 
+def _in_units(policies, mean, std):
+    """The policies that do with mean + std * x what the given ones do with x."""
+    return jax.vmap(networks.fold_normalisation, in_axes=(0, None, None))(policies, mean, std)
+
+
+def test_the_units_of_observations_do_not_matter_to_a_normalised_vae():
+    policies = _policies(3)
+    vae, params = _vae(policies, normalised=True)
+    states = jax.random.normal(jax.random.key(3), (3, 500, 8))
+    mean, std = jnp.linspace(-1.0, 2.0, 8), 10.0 ** jnp.linspace(-1.9, 1.0, 8)
+    in_units = _in_units(policies, mean, std)
+    first = policy_vae.with_statistics(params, states)
+    second = policy_vae.with_statistics(params, mean + std * states)
+
+    posteriors = (
+        policy_vae.encode(vae, first, policies),
+        policy_vae.encode(vae, second, in_units),
+    )
+    np.testing.assert_allclose(*(each.mean for each in posteriors), rtol=1e-3, atol=1e-4)
+    decoded = (
+        policy_vae.decode(vae, first, posteriors[0].mean),
+        policy_vae.decode(vae, second, posteriors[0].mean),
+    )
+    np.testing.assert_allclose(
+        jax.vmap(networks.act)(decoded[0], states),
+        jax.vmap(networks.act)(decoded[1], mean + std * states),
+        rtol=1e-3,
+        atol=1e-4,
+    )
+    # without statistics nothing is done to a policy, and a plain VAE has none
+    plain, plain_params = _vae(policies)
+    np.testing.assert_array_equal(
+        policy_vae.encode(vae, params, policies).mean,
+        policy_vae.encode(plain, plain_params, policies).mean,
+    )
+    assert policy_vae.with_statistics(plain_params, states) is plain_params
+
+
+def test_a_normalised_vae_learns_where_a_plain_one_cannot():
+    mean, std = jnp.zeros(8), jnp.full(8, 0.01)
+    policies = _in_units(_policies(3), mean, std)
+    states = std * jax.random.normal(jax.random.key(3), (3, 2000, 8))
+    found = {}
+    for normalised in (True, False):
+        vae, params = _vae(policies, normalised=normalised)
+        params = policy_vae.with_statistics(params, states)
+        fit_config = fit.FitConfig(learning_rate=1e-2, steps=300, warmup_steps=20)
+        sample_fn = policy_vae.make_sample_fn(vae.config)
+        chunk = fit.make_fit_chunk(policy_vae.make_loss_fn(vae), sample_fn, fit_config, 300)
+        state = fit.init_fit(jax.random.key(4), params, fit_config)
+        state, _ = chunk(state, {"policies": policies, "states": states})
+        if normalised:
+            fitted = state.params[policy_vae.STATISTICS]
+            np.testing.assert_array_equal(fitted["std"], params[policy_vae.STATISTICS]["std"])
+            np.testing.assert_array_equal(fitted["mean"], params[policy_vae.STATISTICS]["mean"])
+        decoded = policy_vae.reconstruct(vae, state.params, jax.random.key(5), policies)
+        found[normalised] = float(policy_vae.policy_kl(policies, decoded, states).max())
+    assert found[True] < 0.1
+    assert found[False] > 3 * found[True]
+
+
 def test_configuration_is_checked():
     with pytest.raises(ValueError, match=r"latent_dim is 0; expected > 0"):
         PolicyVAEConfig(latent_dim=0)

@@ -1,5 +1,6 @@
 """Trained models in little space: what is stored comes back, and nothing else is taken for it."""
 
+import dataclasses
 import json
 import shutil
 import sys
@@ -15,7 +16,7 @@ from experiments import devices, export, generate
 from experiments.errors import UserError
 from experiments.evaluate import measure
 from experiments.models import instructions_of, open_model
-from haland_jax import bert_weights, checkpoint, compact, networks, pretrained
+from haland_jax import bert_weights, checkpoint, compact, networks, policy_vae, pretrained
 from haland_jax.pretrained import BundleError
 
 SHIPPED = pretrained.names()
@@ -142,6 +143,38 @@ def test_generated_policies_act_as_the_models(smoke_bundle):
         jax.vmap(networks.act)(before, states), jax.vmap(networks.act)(after, states)
     )
     assert float(divergence.mean()) < 0.01
+
+
+def test_a_normalised_model_keeps_its_units(smoke_bundle, tmp_path):
+    model = smoke_bundle[0]
+    size = model.haland.architecture.observation_dim
+    statistics = {"mean": jnp.linspace(0.0, 1.0, size), "std": jnp.linspace(0.011, 1.0, size)}
+    haland = dataclasses.replace(
+        model.haland,
+        vae_config=dataclasses.replace(model.haland.vae_config, normalised=True),
+        vae_params={**model.haland.vae_params, policy_vae.STATISTICS: statistics},
+    )
+    normalised = dataclasses.replace(model, haland=haland)
+    pretrained.write(tmp_path, normalised, bert_weights.load_encoder(), {"encoder": ""})
+    found = pretrained.read(tmp_path)
+    v_hat, keys = model.haland.v_hat[:2], jax.random.split(jax.random.key(0), 2)
+    before, _ = haland.generate_from_task_language(v_hat, keys)
+    after, _ = found.haland.generate_from_task_language(v_hat, keys)
+    states = statistics["mean"] + statistics["std"] * jax.random.normal(
+        jax.random.key(1), (2, 64, size)
+    )
+    divergence = networks.kl(
+        jax.vmap(networks.act)(before, states), jax.vmap(networks.act)(after, states)
+    )
+    assert float(divergence.mean()) < 0.01
+    # Weights of such players may differ a hundredfold, which 8 bits a column would not keep.
+    for name in ("held_out_partners", "oracles"):
+        for a, b in zip(
+            jax.tree.leaves(getattr(found, name)),
+            jax.tree.leaves(getattr(model, name)),
+            strict=True,
+        ):
+            np.testing.assert_array_equal(a, b)
 
 
 def test_only_what_fine_tuning_changed_is_stored_of_the_encoder(smoke_bundle):
