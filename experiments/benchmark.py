@@ -3,7 +3,9 @@
     python -m experiments.benchmark env                   Overcooked against JaxMARL's
     python -m experiments.benchmark env --json out.json
     python -m experiments.benchmark lbf                   level-based foraging against Jumanji's
+    python -m experiments.benchmark arm                   the assistive arm beside C MuJoCo
     python -m experiments.benchmark ppo                   training pairs of players
+    python -m experiments.benchmark brax RUN              training one player, beside Brax's PPO
 
 Absolute figures drift with the machine's load; ratios of one run hold.
 """
@@ -14,29 +16,34 @@ import importlib.metadata
 import importlib.util
 import json
 import os
-import time
 from pathlib import Path
+from types import ModuleType
 from typing import Annotated, Any
 
 import jax
-import numpy as np
 import tyro
 from rich.console import Console
 from rich.table import Table
 
 import envs
-from experiments import benchmark_lbf, contenders, contenders_lbf, devices
-from experiments.configs import DEFAULT_ENVIRONMENT, PRESETS
+from experiments import (
+    benchmark_arm,
+    benchmark_lbf,
+    benchmark_ppo,
+    contenders,
+    contenders_lbf,
+    devices,
+    models,
+)
+from experiments.configs import DEFAULT_ENVIRONMENT
 from experiments.contenders import PEER, PEER_PLAIN
-from experiments.errors import UserError, choose, main_guard
+from experiments.errors import UserError, as_user_error, choose, main_guard
 from experiments.machine import describe_machine
 
 KITCHENS = ("cramped_room", "counter_circuit")
 BARS = {"features": 5.0, "grid": 2.0}
 """Times the speed of JaxMARL that each of our observations is expected to reach."""
 DESCRIPTION = "Measure how fast the environments and their training are on this machine."
-PPO_BAR = 80_000
-"""Environment steps per second expected of the training on two cores."""
 INSTALL_PEER = f"{PEER} is not installed; compare with it after: uv sync --group peers"
 
 
@@ -87,6 +94,18 @@ class LbfArguments(_ContestArguments):
 
 
 @dataclasses.dataclass(frozen=True)
+class ArmArguments(_ContestArguments):
+    """Measure the assistive arm with random actions: MJX, and the same model in C MuJoCo.
+
+    Ours shares the games out over one device a core; C MuJoCo plays on as many threads. Its
+    physics has neither observations nor rewards, so it is set beside our physics alone too.
+    """
+
+    steps: int = 50
+    """Steps of each game in one repeat, 0.1 s each."""
+
+
+@dataclasses.dataclass(frozen=True)
 class PpoArguments:
     """Measure PPO with both players learning, all styles and four seeds in one program.
 
@@ -105,10 +124,36 @@ class PpoArguments:
     """Write the result as JSON too."""
 
 
+@dataclasses.dataclass(frozen=True)
+class BraxArguments:
+    """Measure our PPO beside Brax's on the assistive arm: an ego for a frozen partner.
+
+    Both have the same world, steps, networks and settings; Brax's is tried with two learning
+    rates. Times are without compilation.
+    """
+
+    model: Annotated[str, tyro.conf.Positional, tyro.conf.arg(metavar="RUN")]
+    """Where the partner comes from: a finished run's folder, or a model of the package."""
+    style: Annotated[str, tyro.conf.arg(metavar="NAME")] = "scratch_upper_arm"
+    """The partner's style."""
+    steps: int = 1_000_000
+    """Steps of each ego."""
+    seeds: int = 2
+    """Egos of each learner."""
+    games: int = 64
+    """Games in which each ego is judged."""
+    cores: int | None = None
+    """Cores to use; all by default."""
+    json: Annotated[Path | None, tyro.conf.arg(metavar="OUT")] = None
+    """Write the result as JSON too."""
+
+
 Arguments = (
     Annotated[EnvArguments, tyro.conf.subcommand("env")]
     | Annotated[LbfArguments, tyro.conf.subcommand("lbf")]
+    | Annotated[ArmArguments, tyro.conf.subcommand("arm")]
     | Annotated[PpoArguments, tyro.conf.subcommand("ppo")]
+    | Annotated[BraxArguments, tyro.conf.subcommand("brax")]
 )
 
 
@@ -148,46 +193,6 @@ def measure_kitchen(kitchen: str, batch: int, steps: int, repeats: int) -> dict[
             plain = speed / found[PEER_PLAIN]["steps_per_second"]
             row |= {"ratio": ratio, "bar": bar, "met": ratio >= bar, "ratio_to_our_restart": plain}
     return found
-
-
-def measure_ppo(environment: str, updates: int, repeats: int, config: Any = None) -> dict[str, Any]:
-    """Steps per second of training pairs, and seconds to compile.
-
-    Args:
-        environment: name in the registry.
-        updates: updates of every pair in one repeat.
-        repeats: repeats; the fastest counts.
-        config: `PartnersConfig`; four seeds a style with the settings of the preset `quick` by
-            default.
-    """
-    from haland_jax import partners
-    from haland_jax.population import share_out
-
-    env = envs.make(environment)
-    if config is None:
-        quick = PRESETS["quick"](environment, 0).partners
-        config = dataclasses.replace(quick, train_seeds=3, held_out_seeds=1, spare_seeds=0)
-    state = share_out(partners.init_pairs(env, config, jax.random.key(0)))
-    styles = share_out(partners.repeat_styles(env, config.num_seeds))
-    train = partners.compile_training(env, config.joint, updates)
-    pairs = len(env.style_names) * config.num_seeds
-    seconds = []
-    for _ in range(repeats + 1):  # the first one compiles
-        begin = time.perf_counter()
-        state, metrics = jax.block_until_ready(train(state, styles))
-        seconds.append(time.perf_counter() - begin)
-    best = min(seconds)
-    if not np.isfinite(metrics["loss"]).all():
-        raise FloatingPointError("the training's loss is not finite")
-    speed = pairs * updates * config.joint.steps_per_update / best
-    return {
-        "environment": environment,
-        "pairs": pairs,
-        "steps_per_second": speed,
-        "compile_seconds": seconds[0] - best,
-        "bar": PPO_BAR,
-        "met": speed >= PPO_BAR,
-    }
 
 
 def machine() -> dict[str, Any]:
@@ -232,23 +237,6 @@ def env_table(found: dict[str, Any]) -> Table:
     return table
 
 
-def ppo_table(found: dict[str, Any]) -> Table:
-    """The training's speed for the terminal."""
-    table = Table(
-        title=f"PPO, both players learning, {found['pairs']} pairs, {found['environment']}",
-        caption=", ".join(f"{name} {value}" for name, value in found["machine"].items()),
-    )
-    for column in ("steps/s", "bar", "", "compilation"):
-        table.add_column(column, justify="right")
-    table.add_row(
-        f"{found['steps_per_second']:,.0f}",
-        f">= {found['bar']:,}",
-        _judged(found["met"]),
-        f"{found['compile_seconds']:.1f} s",
-    )
-    return table
-
-
 def _prepare(cores: int | None) -> None:
     """Holds the process, and so every contender, to some cores; compiles anew."""
     if cores is not None and hasattr(os, "sched_setaffinity"):
@@ -260,7 +248,7 @@ def _prepare(cores: int | None) -> None:
     jax.config.update("jax_enable_compilation_cache", False)
 
 
-def _check(arguments: EnvArguments | LbfArguments | PpoArguments) -> None:
+def _check(arguments: Arguments) -> None:
     for field in dataclasses.fields(arguments):
         value = getattr(arguments, field.name)
         if isinstance(value, int) and value < 1:
@@ -270,10 +258,12 @@ def _check(arguments: EnvArguments | LbfArguments | PpoArguments) -> None:
     if isinstance(arguments, PpoArguments):
         choose("environment", arguments.env, envs.names(styled_only=True))
         return
+    if isinstance(arguments, BraxArguments):
+        return
     if isinstance(arguments, LbfArguments):
         for encoding in arguments.encodings:
             choose("encoding", encoding, tuple(contenders_lbf.ENCODINGS))
-    else:
+    elif isinstance(arguments, EnvArguments):
         for kitchen in arguments.kitchens:
             choose("kitchen", kitchen, KITCHENS)
     if arguments.batch % arguments.cores:
@@ -282,17 +272,54 @@ def _check(arguments: EnvArguments | LbfArguments | PpoArguments) -> None:
         )
 
 
+def _compile_without_fusion() -> None:
+    """Makes XLA compile all programs in the way that MJX needs on a CPU.
+
+    Brax compiles by itself and takes no options. Call it before the first computation.
+    """
+    flags = os.environ.get("XLA_FLAGS", "")
+    os.environ["XLA_FLAGS"] = f"{flags} --xla_cpu_use_fusion_emitters=false".strip()
+
+
+def _compare_learners(arguments: BraxArguments, contest: ModuleType) -> dict[str, Any]:
+    """Our PPO and Brax's for one of a model's partners."""
+    model = models.open_model(arguments.model)
+    if not model.env.continuous:
+        raise UserError(f"{model.env.name} has discrete actions; Brax needs continuous ones")
+    with as_user_error():
+        config = contest.learner_config(model.env.name, arguments.steps)
+    style = choose("style", arguments.style, model.env.style_names)
+    learners = contest.measure_learners(model, style, config, arguments.seeds, arguments.games)
+    return {
+        "environment": model.env.name,
+        "style": style,
+        "steps": config.total_steps,
+        "seeds": arguments.seeds,
+        "games": arguments.games,
+        "learners": learners,
+        "machine": machine(),
+    }
+
+
 @main_guard
 def main() -> None:
     """The command."""
     arguments = tyro.cli(Arguments, prog="python -m experiments.benchmark", description=DESCRIPTION)
     _check(arguments)
+    if isinstance(arguments, BraxArguments):
+        _compile_without_fusion()
     _prepare(arguments.cores)
     console = Console()
     if isinstance(arguments, PpoArguments):
-        found = measure_ppo(arguments.env, arguments.updates, arguments.repeats)
+        found = benchmark_ppo.measure_ppo(arguments.env, arguments.updates, arguments.repeats)
         found["machine"] = machine()
-        console.print(ppo_table(found))
+        console.print(benchmark_ppo.ppo_table(found))
+    elif isinstance(arguments, BraxArguments):
+        # Brax takes seconds to import, for which the other contests need not wait.
+        from experiments import benchmark_brax
+
+        found = _compare_learners(arguments, benchmark_brax)
+        console.print(benchmark_brax.brax_table(found))
     elif isinstance(arguments, LbfArguments):
         batch, steps = arguments.batch, arguments.steps
         engines = benchmark_lbf.measure_fields(arguments.encodings, batch, steps, arguments.repeats)
@@ -300,6 +327,11 @@ def main() -> None:
         console.print(benchmark_lbf.lbf_table(found))
         if not contenders_lbf.has_peer():
             console.print(benchmark_lbf.INSTALL_PEER, highlight=False)
+    elif isinstance(arguments, ArmArguments):
+        batch, steps = arguments.batch, arguments.steps
+        engines = benchmark_arm.measure_arm(batch, steps, arguments.repeats, arguments.cores)
+        found = {"batch": batch, "steps": steps, "engines": engines, "machine": machine()}
+        console.print(benchmark_arm.arm_table(found))
     else:
         measure = functools.partial(
             measure_kitchen,
