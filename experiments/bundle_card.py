@@ -80,7 +80,8 @@ def _divergence(
             lambda key, ego, partner, style: partners.visited_observations(
                 env, key, ego, partner, style, num_kept=STATES
             )
-        )
+        ),
+        compiler_options=env.compiler_options,
     )
     with_styles = jax.tree.map(lambda leaf: leaf[styles], env.styles)
     states = visit(jax.random.split(play_key, count), first, held_out, with_styles)

@@ -99,7 +99,7 @@ def measure(
     def play(key: jax.Array, egos: Any) -> np.ndarray:
         partner = jax.tree.map(lambda leaf: leaf[style_rows, seed_rows], model.held_out_partners)
         styles = jax.tree.map(lambda leaf: leaf[style_rows], env.styles)
-        return judge.returns(key, egos, partner, styles).reshape(len(rows), seeds)
+        return judge.scores(key, egos, partner, styles).returns.reshape(len(rows), seeds)
 
     returns = play(play_key, jax.tree.map(lambda leaf: jnp.repeat(leaf, seeds, axis=0), policies))
     oracle = play(oracle_key, jax.tree.map(lambda leaf: leaf[style_rows, seed_rows], model.oracles))

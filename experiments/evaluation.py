@@ -13,7 +13,7 @@ import jax.numpy as jnp
 import numpy as np
 
 from experiments.gates import gates, policy_vae_gate
-from experiments.judge import Judge
+from experiments.judge import Judge, Scores, by_style, over_egos
 from experiments.progress import StageProgress
 from experiments.stages import (
     Run,
@@ -67,12 +67,12 @@ def evaluate(run: Run, task: StageProgress) -> dict[str, Any]:
         egos[method], latents[method] = _generate(
             haland, next(keys), repeated.reshape(-1, repeated.shape[-1]), styles
         )
-    results: dict[str, np.ndarray] = {}
+    results: dict[str, Scores] = {}
     for index, (method, policies) in enumerate(egos.items()):
         if method == ORACLE:
             results[method] = _own_partner(judge, next(keys), policies, held_out)
         else:
-            results[method] = judge.with_held_out(next(keys), policies, held_out).mean(axis=2)
+            results[method] = over_egos(judge.with_held_out(next(keys), policies, held_out))
         task.update(index + 1)
     results[WRONG_SENTENCE] = wrong_sentences(judge, next(keys), egos[TEST_SENTENCES], held_out)
     cross = cross_play(judge, next(keys), archive.egos.actor, held_out)
@@ -80,14 +80,13 @@ def evaluate(run: Run, task: StageProgress) -> dict[str, Any]:
     upper_bounds = env.upper_bounds()
     gate = policy_vae_gate(run, judge, next(keys))
     for method, players in zip(COMPARISONS, load_universal(run).values(), strict=True):
-        results[method] = judge.with_held_out(next(keys), players.actor, held_out).mean(axis=2)
+        results[method] = over_egos(judge.with_held_out(next(keys), players.actor, held_out))
         task.update(task.done + 1)
     return {
         "methods": {
-            method: {name: {"returns": by_style[i]} for i, name in enumerate(env.style_names)}
-            for method, by_style in results.items()
+            method: by_style(scores, env.style_names) for method, scores in results.items()
         },
-        "oracle": {name: results[ORACLE][i] for i, name in enumerate(env.style_names)},
+        "oracle": dict(zip(env.style_names, results[ORACLE].returns, strict=True)),
         "gates": gates(results, gate, list(upper_bounds.values())),
         "upper_bounds": upper_bounds,
         "policy_vae": gate,
@@ -124,21 +123,21 @@ def _generate(haland: Haland, key: jax.Array, v_hat: jax.Array, styles: int) -> 
     return partners.unflatten(policies, styles), partners.unflatten(latents, styles)
 
 
-def _own_partner(judge: Judge, key: jax.Array, egos: Policy, held_out: Policy) -> np.ndarray:
-    """Mean return of ego [style, seed] with the held-out partner of the same place."""
-    seeds = jax.tree.leaves(held_out)[0].shape[1]
-    returns = judge.with_held_out(key, egos, held_out)
-    return returns[:, np.arange(seeds), np.arange(seeds)]
+def _own_partner(judge: Judge, key: jax.Array, egos: Policy, held_out: Policy) -> Scores:
+    """Scores of ego [style, seed] with the held-out partner of the same place."""
+    seeds = np.arange(jax.tree.leaves(held_out)[0].shape[1])
+    scores = judge.with_held_out(key, egos, held_out)
+    return scores.map(lambda values: values[:, seeds, seeds])
 
 
-def wrong_sentences(judge: Judge, key: jax.Array, egos: Policy, held_out: Policy) -> np.ndarray:
-    """Mean return with egos made from the sentences of all *other* styles, [style, seed]."""
+def wrong_sentences(judge: Judge, key: jax.Array, egos: Policy, held_out: Policy) -> Scores:
+    """Scores with egos made from the sentences of all *other* styles, [style, seed]."""
     styles, count = jax.tree.leaves(egos)[0].shape[:2]
     others = np.array([[j for j in range(styles) if j != i] for i in range(styles)])
     # One ego of each other style, a different one for each style played with.
     chosen = np.arange(styles)[:, None] % count
     wrong = jax.tree.map(lambda leaf: leaf[others, chosen], egos)
-    return judge.with_held_out(key, wrong, held_out).mean(axis=2)
+    return over_egos(judge.with_held_out(key, wrong, held_out))
 
 
 def cross_play(judge: Judge, key: jax.Array, egos: Policy, held_out: Policy) -> np.ndarray:
@@ -150,7 +149,7 @@ def cross_play(judge: Judge, key: jax.Array, egos: Policy, held_out: Policy) -> 
         ),
         egos,
     )
-    returns = judge.with_held_out(key, everyone, held_out).mean(axis=1)
+    returns = judge.with_held_out(key, everyone, held_out).returns.mean(axis=1)
     return returns.reshape(styles, styles, count).mean(axis=2).T
 
 

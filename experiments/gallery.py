@@ -32,7 +32,8 @@ def record_episodes(run: Run, task: StageProgress) -> None:
     play = jax.jit(
         lambda keys, ego, partner, style: jax.vmap(
             lambda k: rollout.record(env, k, ego, partner, style)
-        )(keys)
+        )(keys),
+        compiler_options=env.compiler_options,
     )
     for index, name in enumerate(env.style_names):
         generate_key, *play_keys = jax.random.split(

@@ -51,8 +51,10 @@ def _compile_game(model: TrainedModel, key: jax.Array) -> Callable[..., Recordin
     """One game of key, ego, partner and style, compiled; any policies of the model's will do."""
     env, style = model.env, model.env.style_names[0]
     ego = jax.tree.map(lambda leaf: leaf[0, 0], model.oracles)
-    game = jax.jit(partial(rollout.record, env))
-    return game.lower(key, ego, model.partner(style), env.style(style)).compile()
+    play = jax.jit(partial(rollout.record, env), compiler_options=env.compiler_options)
+    # A game is played, since a program that is compiled ahead may not hold MJX's model.
+    jax.block_until_ready(play(key, ego, model.partner(style), env.style(style)))
+    return play
 
 
 @main_guard

@@ -1,6 +1,7 @@
 """Plays policies with partners and says what they earn."""
 
-from typing import Any
+from collections.abc import Callable
+from typing import Any, NamedTuple
 
 import jax
 import jax.numpy as jnp
@@ -10,6 +11,23 @@ from haland_jax import partners
 from haland_jax.networks import Policy
 
 
+class Scores(NamedTuple):
+    """Means over the games of each pair, the axes as it is said where they come from.
+
+    Attributes:
+        returns: team reward of a game.
+        successes: share of the games that succeeded; None where games only earn a return.
+    """
+
+    returns: np.ndarray
+    successes: np.ndarray | None
+
+    def map(self, function: Callable[[np.ndarray], np.ndarray]) -> "Scores":
+        """Does the same with both."""
+        successes = None if self.successes is None else function(self.successes)
+        return Scores(function(self.returns), successes)
+
+
 class Judge:
     """Plays policies with partners, many pairs at a time in one compiled program."""
 
@@ -17,20 +35,24 @@ class Judge:
         self.env, self.batch = env, batch
         self._play = partners.compile_evaluation(env, games)
 
-    def returns(self, key: jax.Array, egos: Policy, partner: Policy, styles: Any) -> np.ndarray:
-        """Mean return of each pair; all arguments but the key have the leading axis [pair]."""
+    def scores(self, key: jax.Array, egos: Policy, partner: Policy, styles: Any) -> Scores:
+        """Scores of each pair; all arguments but the key have the leading axis [pair]."""
         total = jax.tree.leaves(styles)[0].shape[0]
         keys = jax.random.split(key, total)
-        means = []
+        returns, successes = [], []
         for first in range(0, total, self.batch):
             rows = np.minimum(np.arange(first, first + self.batch), total - 1)
             pairs = _rows((egos, partner, styles), rows)
             played = self._play(keys[rows], *pairs)
-            means.append(np.asarray(played.returns.mean(axis=1)))
-        return np.concatenate(means)[:total]
+            returns.append(np.asarray(played.returns).mean(axis=1))
+            if self.env.success_event is not None:
+                event = self.env.event_names.index(self.env.success_event)
+                successes.append(np.asarray(played.events)[:, :, 0, event].mean(axis=1))
+        found = Scores(np.concatenate(returns), np.concatenate(successes) if successes else None)
+        return found.map(lambda values: values[:total])
 
-    def with_held_out(self, key: jax.Array, egos: Policy, held_out: Policy) -> np.ndarray:
-        """Mean return of each style's egos with each held-out partner of that style.
+    def with_held_out(self, key: jax.Array, egos: Policy, held_out: Policy) -> Scores:
+        """Scores of each style's egos with each held-out partner of that style.
 
         Args:
             key: consumed.
@@ -44,8 +66,22 @@ class Judge:
         seeds = jax.tree.leaves(held_out)[0].shape[1]
         flat_egos, flat_partners = _all_pairs(egos, held_out)
         each_style = partners.repeat_styles(self.env, seeds * count)
-        returns = self.returns(key, flat_egos, flat_partners, each_style)
-        return returns.reshape(styles, seeds, count)
+        found = self.scores(key, flat_egos, flat_partners, each_style)
+        return found.map(lambda values: values.reshape(styles, seeds, count))
+
+
+def over_egos(scores: Scores) -> Scores:
+    """Means over the egos of [style, seed, ego]."""
+    return scores.map(lambda values: values.mean(axis=2))
+
+
+def by_style(scores: Scores, style_names: tuple[str, ...]) -> dict[str, dict[str, np.ndarray]]:
+    """Scores [style, seed] as results.json holds them."""
+    measured = {name: values for name, values in scores._asdict().items() if values is not None}
+    return {
+        style: {name: values[index] for name, values in measured.items()}
+        for index, style in enumerate(style_names)
+    }
 
 
 @jax.jit

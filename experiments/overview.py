@@ -18,6 +18,7 @@ from experiments.summary import (
     ratios,
     returns,
     sight_shares,
+    success,
     summarise,
 )
 from experiments.worth import worth_of_the_style
@@ -41,6 +42,8 @@ class Overview:
         haland: mean return from test sentences, and its deviation over held-out seeds.
         share: Haland from test sentences / Oracle.
         wrong_share: Haland from a wrong sentence / Oracle.
+        successes: share of the games that succeed with the Oracle and with Haland from test
+            sentences; None where games only earn a return.
         accuracy: share of the test sentences that are translated into their own style.
         universal: return of one ego for all styles, which is told nothing.
         universal_with_label: return of one ego for all styles, which is told the style.
@@ -69,6 +72,7 @@ class Overview:
     haland: tuple[float, float] | None
     share: float | None
     wrong_share: float | None
+    successes: tuple[float, float] | None
     accuracy: float | None
     universal: float | None
     universal_with_label: float | None
@@ -124,6 +128,7 @@ def overview(results: Mapping[str, Any]) -> Overview:
         haland=(rows[HEADLINE].mean, rows[HEADLINE].std) if HEADLINE in rows else None,
         share=_share(results, HEADLINE),
         wrong_share=_share(results, WRONG),
+        successes=_successes(results),
         accuracy=results.get("translator", {}).get("accuracy"),
         universal=rows[UNIVERSAL].mean if UNIVERSAL in rows else None,
         universal_with_label=(
@@ -157,6 +162,11 @@ def _share(results: Mapping[str, Any], method: str) -> float | None:
         return None
     share = mean(ratios(results, method))
     return None if np.isnan(share) else share
+
+
+def _successes(results: Mapping[str, Any]) -> tuple[float, float] | None:
+    oracle, haland = (success(results, method) for method in (ORACLE, HEADLINE))
+    return None if oracle is None or haland is None else (oracle, haland)
 
 
 def _upper_bounds(

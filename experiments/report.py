@@ -1,6 +1,6 @@
 """The run's report for a reader who was not there, and its summary for the terminal."""
 
-from collections.abc import Iterable, Mapping
+from collections.abc import Iterable, Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
@@ -103,11 +103,12 @@ def summary_table(results: Mapping[str, Any]) -> Table:
         title=f"{results['environment']}, preset {results['preset']}", title_justify="left"
     )
     table.add_column("method")
-    for name in ("return", "of the Oracle", "episodes"):
+    rows = summarise(results)
+    for name in _columns(rows, "of the Oracle"):
         table.add_column(name, justify="right")
-    for row in summarise(results):
+    for row in rows:
         style = "bold" if row.method == HEADLINE else ""
-        table.add_row(row.method, *_numbers(row), style=style)
+        table.add_row(row.method, *_numbers(row, rows), style=style)
     for name, gate in results.get("gates", {}).items():
         verdict = "[green]met[/]" if gate["met"] else "[red]missed[/]"
         table.add_row(f"gate: {name}", _number(gate["value"]), _bar(gate), verdict)
@@ -157,9 +158,10 @@ def _verdict(results: Mapping[str, Any]) -> str:
 
 def _headline(results: Mapping[str, Any]) -> str:
     meaning = {**_MEANING, **_universal(results), **results.get("descriptions", {})}
-    rows = [(row.method, *_numbers(row), meaning.get(row.method, "")) for row in summarise(results)]
-    head = ("method", "return", "return / Oracle", "episodes", "what it is")
-    table = _table(head, rows, "lrrrl")
+    summary = summarise(results)
+    rows = [(row.method, *_numbers(row, summary), meaning.get(row.method, "")) for row in summary]
+    head = ("method", *_columns(summary, "return / Oracle"), "what it is")
+    table = _table(head, rows, "l" + "r" * (len(head) - 2) + "l")
     note = (
         "Mean ± sample standard deviation over the held-out seeds, of each seed's mean over "
         "styles. The ratio divides each partner's return by that partner's own Oracle."
@@ -300,10 +302,19 @@ def _costs(results: Mapping[str, Any]) -> str:
     return "\n\n".join(parts)
 
 
-def _numbers(row: MethodSummary) -> tuple[str, str, str]:
+def _columns(rows: Sequence[MethodSummary], ratio: str) -> tuple[str, ...]:
+    """Heads of what `_numbers` gives."""
+    success = ("success",) if any(row.success is not None for row in rows) else ()
+    return ("return", ratio, *success, "episodes")
+
+
+def _numbers(row: MethodSummary, rows: Sequence[MethodSummary]) -> tuple[str, ...]:
+    """A row's cells under `_columns(rows, …)`."""
     count = "–" if row.episodes is None else f"{row.episodes:,}"
     ratio = "–" if np.isnan(row.ratio) else f"{row.ratio:.3f} ± {row.ratio_std:.3f}"
-    return _with_spread(row.mean, row.std), ratio, count
+    success = ("–",) if row.success is None else (f"{row.success:.0%}",)
+    success = success if any(other.success is not None for other in rows) else ()
+    return _with_spread(row.mean, row.std), ratio, *success, count
 
 
 def _with_spread(centre: float, deviation: float) -> str:

@@ -59,6 +59,12 @@ _MEASURED: tuple[_Column, ...] = (
         "Haland / Oracle from another style's sentence: the control, which must fall.",
     ),
     (
+        "success",
+        lambda row: _success(row.successes),
+        "share of the games that succeed with Haland from test sentences, in brackets with the "
+        "Oracle; – where games only earn a return.",
+    ),
+    (
         "translator",
         lambda row: percent(row.accuracy),
         "share of the test sentences that are translated into their own style.",
@@ -208,6 +214,11 @@ def _meanings(columns: Sequence[_Column]) -> str:
 
 def _with_lowest(value: float | None, lowest: float | None) -> str:
     return "–" if value is None else f"{value:.2f} ({number(lowest, 2)})"
+
+
+def _success(shares: tuple[float, float] | None) -> str:
+    """Haland's share of games that succeed, and the Oracle's."""
+    return "–" if shares is None else f"{shares[1]:.2f} ({shares[0]:.2f})"
 
 
 def _commands(overviews: Sequence[Overview]) -> list[str]:

@@ -106,7 +106,7 @@ def _stage(sight: int) -> str:
 
 def _measure_one(run: Any, sight: int, task: StageProgress) -> dict[str, Any]:
     """Trains the egos with one view and plays them with the held-out partners."""
-    from experiments.judge import Judge
+    from experiments.judge import Judge, by_style, over_egos
     from experiments.stages import load_population, load_universal_in, train_universal_in
 
     config = run.config
@@ -118,8 +118,8 @@ def _measure_one(run: Any, sight: int, task: StageProgress) -> dict[str, Any]:
     methods = {}
     egos = load_universal_in(run, env, _stage(sight))
     for method, key, players in zip(COMPARISONS, keys, egos.values(), strict=True):
-        returns = judge.with_held_out(key, players.actor, held_out).mean(axis=2)
-        methods[method] = {name: {"returns": returns[i]} for i, name in enumerate(env.style_names)}
+        scores = over_egos(judge.with_held_out(key, players.actor, held_out))
+        methods[method] = by_style(scores, env.style_names)
     return {"cells": sight, "steps": trained["steps"], "methods": methods}
 
 

@@ -37,13 +37,17 @@ PARTNER_SIGHT = "partner_sight"
 
 @dataclasses.dataclass(frozen=True)
 class MethodSummary:
-    """One row of the headline table; the ratio is the return divided by that partner's Oracle."""
+    """One row of the headline table; the ratio is the return divided by that partner's Oracle.
+
+    `success` is the share of games that succeeded, None where games only earn a return.
+    """
 
     method: str
     mean: float
     std: float
     ratio: float
     ratio_std: float
+    success: float | None
     episodes: int | None
 
 
@@ -85,6 +89,13 @@ def episodes(results: Mapping[str, Any], method: str) -> int | None:
     if not seeds or not all(isinstance(seed, Sequence) for seed in seeds):
         return None
     return sum(len(seed) for seed in seeds)
+
+
+def success(results: Mapping[str, Any], method: str) -> float | None:
+    """The share of a method's games that succeeded; None where that was not measured."""
+    by_style = results["methods"].get(method, {}).values()
+    found = [np.mean(style["successes"]) for style in by_style if "successes" in style]
+    return float(np.mean(found)) if found else None
 
 
 def ratios(results: Mapping[str, Any], method: str) -> np.ndarray:
@@ -150,6 +161,7 @@ def summarise(results: Mapping[str, Any]) -> list[MethodSummary]:
                 std=spread(by_seed),
                 ratio=mean(ratio),
                 ratio_std=spread(ratio_by_seed),
+                success=success(results, method),
                 episodes=episodes(results, method),
             )
         )

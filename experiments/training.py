@@ -12,12 +12,13 @@ from typing import Any
 import jax
 import numpy as np
 
-from envs.base import Environment
+from envs.base import Environment, Pair
 from experiments.progress import StageProgress
 from haland_jax import checkpoint, fit, partners
 from haland_jax.fit import FitConfig, FitState
+from haland_jax.learner import TrainState
 from haland_jax.population import share_out
-from haland_jax.ppo import PPOConfig, TrainState
+from haland_jax.ppo import PPOConfig
 
 SECONDS_BETWEEN_CHECKPOINTS = 20.0
 UPDATES_PER_PIECE = 25
@@ -49,7 +50,7 @@ def train_population(
     saver: Saver,
     report: Callable[[int, dict[str, float]], None],
     stage: str,
-) -> tuple[TrainState, np.ndarray]:
+) -> tuple[Pair, np.ndarray]:
     """Trains a population to its end.
 
     Args:
@@ -62,7 +63,8 @@ def train_population(
         stage: for messages.
 
     Returns:
-        The trained states, and the training games' mean return, [update, member].
+        The trained players (`partners.trained_players`), and the training games' mean return,
+        [update, member].
 
     Raises:
         NonFiniteLoss: training diverged.
@@ -87,7 +89,7 @@ def train_population(
         done += size
         report(done, {"return": float(metrics["return"].mean())})
         saver.save_if_due({"state": state, "returns": returns})
-    return state, returns
+    return partners.trained_players(state), returns
 
 
 def run_fit(

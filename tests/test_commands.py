@@ -162,7 +162,7 @@ def test_a_diverged_training_stops_with_the_stages_name(tmp_path):
         training.train_population(
             game,
             config,
-            lambda: partners.init_pairs(game, counts, jax.random.key(0)),
+            lambda: partners.init_pairs(game, counts.joint, counts.num_seeds, jax.random.key(0)),
             partners.repeat_styles(game, 2),
             training.Saver(tmp_path / "unfinished"),
             lambda *_: None,

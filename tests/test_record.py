@@ -90,6 +90,7 @@ def test_the_pages_numbers_are_those_worked_out_by_hand():
         "Haland": "98 ± 4",  # 95 and 100
         "Haland / Oracle": "**0.800**",
         "wrong sentence": "0.10",
+        "success": "–",
         "translator": "88%",
         "gates met": "1 of 2",
     }
@@ -98,6 +99,18 @@ def test_the_pages_numbers_are_those_worked_out_by_hand():
         *("`overnight`", "0", "2 styles × 2 seeds", "30", "Fast, 2 cores", "2026-11-22")
     ]
     assert "earns 80.0% of the Oracle; it reaches the aim of 95% in 0 of 1 environments" in page
+
+
+def test_where_games_can_succeed_the_page_says_how_many_do():
+    results = small_results()
+    haland = results["methods"]["Haland, test sentences"]
+    oracle = {style: {"returns": seeds} for style, seeds in results["oracle"].items()}
+    for style, (with_haland, with_oracle) in {"left": (0.7, 1.0), "right": (0.9, 0.9)}.items():
+        haland[style]["successes"] = [with_haland, with_haland + 0.1]
+        oracle[style]["successes"] = [with_oracle, with_oracle]
+    results["methods"] = {"Oracle": oracle, **results["methods"]}
+    # (0.7 + 0.8 + 0.9 + 1) / 4 and (1 + 1 + 0.9 + 0.9) / 4
+    assert rows_of(results_page.page([overview(results)], ""))[0]["success"] == "0.85 (0.95)"
 
 
 def test_a_view_that_ends_nearby_has_its_row_beside_the_full_one():

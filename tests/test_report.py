@@ -55,6 +55,18 @@ def with_shares(results: dict, shares: dict[str, float]) -> dict:
     return results
 
 
+def test_successes_are_shown_where_games_can_succeed(tmp_path):
+    results = made_up_results()
+    assert "| success |" not in report.write_report(results, tmp_path).read_text()
+    for method in results["methods"].values():
+        for index, style in enumerate(STYLES):
+            method[style]["successes"] = [1.0, 0.5] if index == 0 else [0.0, 0.0]
+    returns = section(report.write_report(results, tmp_path).read_text(), "Returns")
+    assert "| success |" in returns
+    (haland,) = [line for line in returns.splitlines() if line.startswith(f"| {summary.HEADLINE}")]
+    assert f"| {0.75 / len(STYLES):.0%} |" in haland
+
+
 @pytest.mark.parametrize(
     ("told", "haland", "expected"),
     [

@@ -30,16 +30,16 @@ def train(path, *, die_after: int | None = None):
         if done == die_after:
             raise Killed
 
-    state, returns = training.train_population(
+    players, returns = training.train_population(
         game,
         CONFIG,
-        lambda: partners.init_pairs(game, COUNTS, jax.random.key(0)),
+        lambda: partners.init_pairs(game, COUNTS.joint, COUNTS.num_seeds, jax.random.key(0)),
         partners.repeat_styles(game, 2),
         training.Saver(path),
         report,
         "partners",
     )
-    return state, returns, reported
+    return players, returns, reported
 
 
 def test_a_population_goes_on_where_it_was_and_ends_alike(monkeypatch, tmp_path):
@@ -57,8 +57,8 @@ def test_a_population_goes_on_where_it_was_and_ends_alike(monkeypatch, tmp_path)
     assert reported == [4, 5], "the piece after the last checkpoint is done again, no other"
     np.testing.assert_allclose(resumed_returns, returns, rtol=1e-6)
     for one, two in zip(
-        jax.tree.leaves((whole.ego, whole.partner)),
-        jax.tree.leaves((resumed.ego, resumed.partner)),
+        jax.tree.leaves(whole),
+        jax.tree.leaves(resumed),
         strict=True,
     ):
         np.testing.assert_allclose(one, two, rtol=1e-5, atol=1e-6)

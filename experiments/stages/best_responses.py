@@ -73,7 +73,7 @@ def _refit_egos(
         "best responses",
     )
     num_styles = len(env.style_names)
-    egos = partners.unflatten(Player(refitted.ego.actor, refitted.ego.critic), num_styles)
+    egos = partners.unflatten(refitted.ego, num_styles)
 
     teachers = partners.teachers(env, config, population)
     count = jax.tree.leaves(teachers)[0].shape[1]

@@ -48,6 +48,7 @@ def fit_policy_vae(run: Run, task: StageProgress) -> dict[str, Any]:
         ],
         axis=1,
     )
+    params = policy_vae.with_statistics(params, fixed)
     first = visits.own_partners(decoded_key, policies, decoded)
     data = {"policies": policies, "states": jnp.concatenate([fixed, first], axis=1)}
 
@@ -112,9 +113,8 @@ class Visits:
     def _visit(self, key: jax.Array, policies: Policy, number: int, shift: int) -> jax.Array:
         env, times = self.run.env, self.run.config.partners.train_seeds
         if number not in self._programs:
-            self._programs[number] = over_population(
-                partial(partners.visited_observations, env, num_kept=number)
-            )
+            visit = partial(partners.visited_observations, env, num_kept=number)
+            self._programs[number] = over_population(visit, compiler_options=env.compiler_options)
         others = _for_each_policy(self.teachers, times, shift)
         styles = _for_each_policy(env.styles, times, shift)
         keys = jax.random.split(key, len(env.style_names) * times)

@@ -1,6 +1,7 @@
 """Partners of every style: trained in pairs, the best kept."""
 
 import itertools
+from functools import partial
 from typing import Any
 
 import jax
@@ -21,17 +22,19 @@ def make_partners(run: Run, task: StageProgress) -> dict[str, Any]:
     """Stage 1a: trains pairs of every style and seed together and keeps the best."""
     config, env = run.config.partners, run.env
     train_key, play_key = jax.random.split(run.key("partners"))
-    state, curve = train_population(
+    players, curve = train_population(
         env,
         config.joint,
-        lambda: partners.init_pairs(env, config, train_key),
+        lambda: partners.init_pairs(env, config.joint, config.num_seeds, train_key),
         partners.repeat_styles(env, config.num_seeds),
         Saver(run.path("partners", "unfinished")),
         task.update,
         "partners",
     )
-    returns = mean_returns(run, play_key, state.ego.actor, state.partner.actor, config.num_seeds)
-    population = partners.make_population(env, config, state, returns)
+    returns = mean_returns(
+        run, play_key, players.ego.actor, players.partner.actor, config.num_seeds
+    )
+    population = partners.make_population(env, config, players, returns)
     checkpoint.save(run.path("partners", "population"), population)
     points = np.linspace(0, len(curve), min(CURVE_POINTS, len(curve)) + 1).astype(int)
     smooth = [curve[a:b].mean(0) for a, b in itertools.pairwise(points)]
@@ -48,7 +51,8 @@ def make_partners(run: Run, task: StageProgress) -> dict[str, Any]:
 def load_population(run: Run) -> Population:
     """The partners that `make_partners` kept."""
     config, env = run.config.partners, run.env
-    shapes = jax.eval_shape(lambda key: partners.init_pairs(env, config, key), jax.random.key(0))
+    start = partial(partners.init_pairs, env, config.joint, config.num_seeds)
+    shapes = jax.eval_shape(start, jax.random.key(0))
 
     styles = len(env.style_names)
 
@@ -63,7 +67,7 @@ def load_population(run: Run) -> Population:
     shape: Any = jax.ShapeDtypeStruct
     like = Population(
         partners=by_style(shapes.partner.actor),
-        egos=by_style(Player(shapes.ego.actor, shapes.ego.critic)),
+        egos=by_style(jax.eval_shape(Player.of, shapes.ego)),
         joint_returns=shape((styles, config.num_seeds), jnp.float32),
         train_index=shape((styles, config.train_seeds), jnp.int32),
         held_out_index=shape((styles, config.held_out_seeds), jnp.int32),

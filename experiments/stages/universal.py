@@ -38,7 +38,7 @@ def train_universal_in(
     config, env = run.config.universal, Labelled(game)
     teachers = partners.teachers(run.env, run.config.partners, load_population(run))
     key = run.key(STAGE)
-    state, returns = train_population(
+    players, returns = train_population(
         env,
         config.training,
         lambda: universal.init_universal(env, config, key, teachers),
@@ -47,7 +47,7 @@ def train_universal_in(
         task.update,
         "universal egos",
     )
-    checkpoint.save(run.path(stage, "egos"), Player(state.ego.actor, state.ego.critic))
+    checkpoint.save(run.path(stage, "egos"), players.ego)
     points = np.linspace(0, len(returns), min(CURVE_POINTS, len(returns)) + 1).astype(int)
     smooth = np.array([returns[a:b].mean(axis=0) for a, b in itertools.pairwise(points)])
     curves = smooth.reshape(len(smooth), len(universal.VARIANTS), -1)  # [point, variant, seed]
@@ -73,6 +73,6 @@ def load_universal_in(run: Run, game: Environment, stage: str) -> dict[str, Play
     shapes = jax.eval_shape(
         lambda key: universal.init_universal(env, config, key, teachers), jax.random.key(0)
     )
-    like = Player(shapes.ego.actor, shapes.ego.critic)
+    like = jax.eval_shape(Player.of, shapes.ego)
     egos = checkpoint.restore(run.path(stage, "egos"), like)
     return universal.players_by_style(env, egos)
