@@ -17,8 +17,8 @@ from envs.base import Pair
 from haland_jax.population import over_population
 
 ENVIRONMENT = "assistive/jaco"
-BAR = 50_000
-"""Control steps per second expected of the environment on two cores."""
+BAR, CORES = 50_000, 2
+"""Control steps per second expected of the environment, and the cores that this is said of."""
 OURS, PHYSICS, PEER = "ours, whole environment", "ours, physics alone", "C MuJoCo, mujoco.rollout"
 
 
@@ -33,7 +33,7 @@ def measure_arm(batch: int, steps: int, repeats: int, cores: int) -> dict[str, A
 
     Returns:
         By contender: `steps_per_second`; for ours also `ratio` to C MuJoCo, and for the whole
-        environment `bar` and `met`.
+        environment on two cores `bar` and `met`.
     """
     programs = {
         OURS: _environment(batch, steps),
@@ -52,8 +52,9 @@ def measure_arm(batch: int, steps: int, repeats: int, cores: int) -> dict[str, A
     for name in (OURS, PHYSICS):
         speed = found[name]["steps_per_second"]
         found[name]["ratio"] = speed / found[PEER]["steps_per_second"]
-    speed = found[OURS]["steps_per_second"]
-    found[OURS] |= {"bar": BAR, "met": speed >= BAR}
+    if cores == CORES:
+        met = found[OURS]["steps_per_second"] >= BAR
+        found[OURS] |= {"bar": BAR, "met": met}
     return found
 
 

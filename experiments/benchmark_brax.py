@@ -37,7 +37,7 @@ def learner_config(environment: str, steps: int) -> PPOConfig:
     and games that start at random moments.
 
     Raises:
-        ValueError: too few steps.
+        ValueError: too few steps, or devices that do not divide the games, as Brax needs it.
     """
     config = PRESETS["overnight"](environment, 0).partners.joint
     config = dataclasses.replace(
@@ -46,6 +46,12 @@ def learner_config(environment: str, steps: int) -> PPOConfig:
     if config.num_updates < PIECES:
         raise ValueError(
             f"steps is {steps:,}; expected at least {PIECES * config.steps_per_update:,}"
+        )
+    devices, minibatch = jax.local_device_count(), config.num_envs // config.num_minibatches
+    if minibatch % devices:
+        raise ValueError(
+            f"there are {devices} devices; expected a divisor of {minibatch}, the games of a "
+            "minibatch, because Brax shares them out equally"
         )
     updates = config.num_updates // PIECES * PIECES
     return dataclasses.replace(config, total_steps=updates * config.steps_per_update)

@@ -24,6 +24,7 @@ class Adaptation:
         length: factor on the steps of the joint training.
         refit_length: factor on the steps of the best responses' refits.
         joint: settings of the joint training that differ.
+        refit: settings of the best responses' refits that differ.
         training: settings of every training that differ; with `normalise` the policy VAE
             compresses normalised policies too.
     """
@@ -32,6 +33,7 @@ class Adaptation:
     length: float = 1.0
     refit_length: float = 1.0
     joint: Mapping[str, Any] = dataclasses.field(default_factory=dict)
+    refit: Mapping[str, Any] = dataclasses.field(default_factory=dict)
     training: Mapping[str, Any] = dataclasses.field(default_factory=dict)
 
 
@@ -50,12 +52,13 @@ ADAPTATIONS = {
     "lbf/spread": Adaptation(
         max_steps=50, length=0.4, training={"reward_scale": 2.0, "confined_until": 0.0}
     ),
-    # Speeds of joints, and observations of several units. Scratching a forearm takes longest:
-    # 0.69 of the games succeed after 1.2 M steps, 0.88 after 1.6 M, the other tasks' all by 0.8 M.
+    # Speeds of joints, and observations of several units. At the mouth all pairs succeed within
+    # 0.4 M steps; scratching and bathing take longest. High rates ruin egos that are good already.
     "assistive/jaco": Adaptation(
         max_steps=200,
-        length=1.5,
+        length=1.25,
         refit_length=0.4,
+        refit={"learning_rate": 3e-4},
         training={
             "normalise": True,
             "entropy": 0.001,
@@ -169,7 +172,7 @@ def _adapted(config: RunConfig) -> RunConfig:
         partners=dataclasses.replace(
             partners,
             joint=changed(partners.joint, change.length, **change.joint),
-            refit=changed(partners.refit, change.refit_length),
+            refit=changed(partners.refit, change.refit_length, **change.refit),
             oracle=changed(partners.oracle),
         ),
         compression=dataclasses.replace(

@@ -81,7 +81,7 @@ def measure(
     model: TrainedModel, sentences: dict[str, list[str]], games: int, seed: int
 ) -> dict[str, Any]:
     """Plays one policy a sentence with every held-out partner of the sentence's style."""
-    from experiments.judge import Judge
+    from experiments.judge import Judge, Scores
 
     haland, env, seeds = model.haland, model.env, model.held_out_seeds
     generate_key, play_key, oracle_key = jax.random.split(jax.random.key(seed), 3)
@@ -96,13 +96,17 @@ def measure(
     seed_rows = np.tile(np.arange(seeds), len(rows))
     judge = Judge(env, games, min(LARGEST_BATCH, len(style_rows)))
 
-    def play(key: jax.Array, egos: Any) -> np.ndarray:
+    def play(key: jax.Array, egos: Any) -> Scores:
         partner = jax.tree.map(lambda leaf: leaf[style_rows, seed_rows], model.held_out_partners)
         styles = jax.tree.map(lambda leaf: leaf[style_rows], env.styles)
-        return judge.scores(key, egos, partner, styles).returns.reshape(len(rows), seeds)
+        scores = judge.scores(key, egos, partner, styles)
+        return scores.map(lambda values: values.reshape(len(rows), seeds))
 
-    returns = play(play_key, jax.tree.map(lambda leaf: jnp.repeat(leaf, seeds, axis=0), policies))
-    oracle = play(oracle_key, jax.tree.map(lambda leaf: leaf[style_rows, seed_rows], model.oracles))
+    played = play(play_key, jax.tree.map(lambda leaf: jnp.repeat(leaf, seeds, axis=0), policies))
+    best = play(oracle_key, jax.tree.map(lambda leaf: leaf[style_rows, seed_rows], model.oracles))
+    returns, oracle = played.returns, best.returns
+    succeeds = {"success": played.successes, "oracle_success": best.successes}
+    succeeds = {name: shown for name, shown in succeeds.items() if shown is not None}
     found: dict[str, Any] = {}
     for style in sentences:
         index = env.style_names.index(style)
@@ -113,6 +117,7 @@ def measure(
             "return": float(returns[mine].mean()),
             "oracle": float(oracle[mine].mean()),
             "share_of_oracle": None if np.isnan(share) else share,
+            **{name: float(shown[mine].mean()) for name, shown in succeeds.items()},
             "sentences": [
                 {
                     "sentence": rows[i][1],
@@ -131,6 +136,7 @@ def measure(
             "accuracy": float(np.mean([f["accuracy"] for f in found.values()])),
             "return": float(np.mean([f["return"] for f in found.values()])),
             "share_of_oracle": float(np.mean(measured)) if measured else None,
+            **{name: float(np.mean([f[name] for f in found.values()])) for name in succeeds},
         },
     }
 
@@ -139,13 +145,23 @@ def table_of(found: dict[str, Any]) -> Table:
     """The result by style as a table for the terminal."""
     table = Table(title=f"Held-out partners, {found['environment']}")
     table.add_column("style")
-    for column in ("sentences", "translated right", "return", "return / Oracle"):
+    succeeds = {"success": "success", "oracle_success": "Oracle's success"}
+    succeeds = {name: title for name, title in succeeds.items() if name in found["mean"]}
+    for column in (
+        "sentences",
+        "translated right",
+        "return",
+        "return / Oracle",
+        *succeeds.values(),
+    ):
         table.add_column(column, justify="right")
 
     def row(name: str, values: dict[str, Any], count: str) -> None:
         share = values["share_of_oracle"]
         shown = "–" if share is None else f"{share:.2f}"
-        table.add_row(name, count, f"{values['accuracy']:.0%}", f"{values['return']:.1f}", shown)
+        succeeded = [f"{values[name]:.0%}" for name in succeeds]
+        earned = f"{values['return']:.1f}"
+        table.add_row(name, count, f"{values['accuracy']:.0%}", earned, shown, *succeeded)
 
     for style, values in found["styles"].items():
         row(style, values, str(len(values["sentences"])))

@@ -10,8 +10,9 @@ from flax.struct import PyTreeNode
 
 from haland_jax import networks
 
-LEAST_STD = 0.01
-"""Below it a number counts as constant, and is not blown up."""
+LEAST_STD = 0.05
+"""Below it a number counts as constant, and is not blown up: what hardly varied in training may
+vary with another partner, and would then move a policy far from all that it has learnt."""
 
 
 class Normaliser(PyTreeNode):

@@ -23,7 +23,7 @@ from haland_jax.learner import (
     make_networks,
     make_optimizer,
 )
-from haland_jax.networks import MLPActor, MLPCritic, Policy
+from haland_jax.networks import MLPActor, Policy
 from haland_jax.ppo_loss import Batch, PPOConfig, generalised_advantages, ppo_loss
 
 
@@ -124,11 +124,8 @@ def _update(
         if not isinstance(learner, Learner):
             continue
         actor = actors[agent]
-        rewards = scaled[agent]
-        if config.bootstrap_truncated:
-            rewards += config.discount * steps["cut_off"][agent]
         batch = _make_batch(
-            config, critic, learner, steps, state.observations[agent], agent, rewards
+            config, critic, learner, steps, state.observations[agent], agent, scaled[agent]
         )
         strided = isinstance(style, StylesByGame) or not isinstance(state.partner, Learner)
         learner, loss = _learn(config, actor, critic, learner, batch, strided=strided, **rates)
@@ -188,13 +185,12 @@ def _rollout(
     random_share: jax.Array,
 ) -> tuple[TrainState, dict[str, Any]]:
     """Plays `rollout_steps` steps of all games; finished games start anew."""
-    actors, critic = make_networks(env)
+    actors, _ = make_networks(env)
     ego = partial(_distribution, actors.ego, state.ego)
     if isinstance(state.partner, Learner):
         partner = partial(_distribution, actors.partner, state.partner)
     else:
         partner = partial(_frozen_partners, actors.partner, config.partner_noise, state.partner)
-    players = (state.ego, state.partner)
     play = _over_games(lambda style, key, game, actions: env.step(key, game, actions, style), style)
     restart_all = _over_games(_restart(env, random_share), style)
 
@@ -224,13 +220,6 @@ def _rollout(
             "ended": done,
             "terminated": timesteps.terminated,
         }
-        if config.bootstrap_truncated:
-            kept["cut_off"] = Pair(
-                *(
-                    timesteps.truncated * _value(critic, learner, seen)
-                    for learner, seen in zip(players, timesteps.observation, strict=True)
-                )
-            )
         states = jax.tree.map(restart, fresh, following)
         observations = jax.tree.map(restart, first.observation, timesteps.observation)
         return (states, observations), kept
@@ -245,15 +234,6 @@ def _rollout(
 def _distribution(actor: MLPActor, learner: Learner, observation: jax.Array) -> Any:
     """What a learner does on raw observations [env, O]."""
     return actor.apply(learner.actor, normalisation.normalise(learner.normaliser, observation))
-
-
-def _value(critic: MLPCritic, player: Learner | Policy, observation: jax.Array) -> jax.Array:
-    """What a learner expects of raw observations [env, O]; nothing for frozen partners."""
-    if not isinstance(player, Learner):
-        return jnp.zeros(())
-    seen = normalisation.normalise(player.normaliser, observation)
-    value: Any = critic.apply(player.critic, seen)
-    return value
 
 
 def _frozen_partners(

@@ -40,8 +40,6 @@ class PPOConfig:
         final_random_start: see `random_start`. Some random moments to the end keep both players
             from conventions that only the two of them share.
         normalise: whether learners read observations by their running mean and deviation.
-        bootstrap_truncated: whether a game that ran out of time is worth what the critic expects
-            of going on; for players that do not see the time.
         partner_noise: chance that a frozen partner plays a random action instead of its own,
             so that the ego meets more than the conventions of the partners it trains with.
     """
@@ -68,7 +66,6 @@ class PPOConfig:
     random_start_until: float = 0.5
     final_random_start: float = 0.4
     normalise: bool = False
-    bootstrap_truncated: bool = False
     partner_noise: float = 0.0
 
     def __post_init__(self):

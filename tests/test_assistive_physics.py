@@ -19,6 +19,17 @@ def c_step(data: mujoco.MjData, velocities: np.ndarray) -> None:
         mujoco.mj_step(data.model, data)
 
 
+def c_forces(data: mujoco.MjData) -> list[float]:
+    """Normal force of each of the `CONTACTS`, N."""
+    found = dict.fromkeys(map(frozenset, physics.CONTACTS), 0.0)
+    force = np.zeros(6)
+    for number in range(data.ncon):
+        mujoco.mj_contactForce(data.model, data, number, force)
+        names = frozenset(data.model.geom(geom).name for geom in data.contact[number].geom)
+        found[names] += force[0]
+    return list(found.values())
+
+
 def near_the_arm(rng: np.random.Generator) -> np.ndarray:
     """Angles at which the tool is about to touch the person's forearm or upper arm, rad."""
     mujoco_model = model.mujoco_model()
@@ -46,9 +57,8 @@ def near_the_arm(rng: np.random.Generator) -> np.ndarray:
 def played() -> dict[str, np.ndarray]:
     """100 control steps of random actions from touching starts, in MJX and in C.
 
-    In half of the games the person does not sit in the usual place. Of 32 such games of the first
-    eight seeds 30 stay below 1e-4 rad, most below 1e-5, and two with 14 and 19 steps of contact
-    reach 1.3e-4, with twice the solver's iterations as well: MJX computes in single precision.
+    In half of the games the person does not sit in the usual place. 32 such games of the first
+    eight seeds, with up to 15 steps of contact, stay below 6e-5 rad, most below 1e-5.
     """
     rng = np.random.default_rng(1)
     starts = np.stack([near_the_arm(rng) for _ in range(4)])
@@ -73,13 +83,13 @@ def played() -> dict[str, np.ndarray]:
         for step in range(STEPS):
             c_step(data, velocities[game, step])
             reference.append(data.qpos.copy())
-            pushed.append(sum(abs(data.efc_force[: data.nefc])))
+            pushed.append(c_forces(data))
     shape = (len(starts), STEPS, -1)
     return {
         "angles": angles,
         "forces": forces,
         "reference": np.reshape(reference, shape),
-        "pushed": np.reshape(pushed, shape)[..., 0],
+        "pushed": np.reshape(pushed, shape),
     }
 
 
@@ -101,10 +111,10 @@ def test_the_seat_carries_the_whole_person_and_nothing_else():
 
 
 def test_the_games_had_contact(played):
-    touching = (played["pushed"] > 0).sum(axis=1)
+    touching = (played["pushed"] > 0).any(axis=-1).sum(axis=1)
     assert (touching >= 2).all(), touching
-    assert touching.sum() >= 30, touching
+    assert touching.sum() >= 20, touching
 
 
 def test_forces_are_those_of_c(played):
-    np.testing.assert_allclose(played["forces"].sum(axis=-1), played["pushed"], atol=0.05)
+    np.testing.assert_allclose(played["forces"], played["pushed"], atol=0.05)

@@ -74,17 +74,34 @@ def test_an_itch_lies_on_the_skin_where_it_was_drawn():
 @pytest.mark.parametrize(("lift", "presented"), [(0.0, False), (29.0, False), (45.0, True)])
 def test_an_arm_is_presented_when_it_is_lifted(lift, presented):
     found = tasks.find_target(
-        poses(lift=lift), style("scratch_upper_arm"), aim(0.5, 90.0), tasks.first_progress(ALL)
+        poses(lift=lift), style("scratch_upper_arm"), aim(0.5, 110.0), tasks.first_progress(ALL)
     )
     assert bool(found.presented) is presented
     assert (float(found.effort) > 0) is not presented
 
 
-def test_a_place_behind_the_arm_is_not_presented():
+@pytest.mark.parametrize(
+    ("around", "effort"), [(116.0, 0.0), (102.0, 0.0), (130.0, 0.0), (66.0, 29.6), (-90.0, 134.4)]
+)
+def test_a_place_is_presented_on_the_side_of_the_robot(around, effort):
+    """The robot is 116 degrees around an upper arm lifted by 45, seen from its middle."""
     found = tasks.find_target(
-        poses(lift=45.0), style("scratch_upper_arm"), aim(0.5, -90.0), tasks.first_progress(ALL)
+        poses(lift=45.0), style("scratch_upper_arm"), aim(0.5, around), tasks.first_progress(ALL)
     )
-    assert not found.presented
+    assert bool(found.presented) is (effort == 0.0)
+    assert np.degrees(found.effort) == pytest.approx(effort, abs=0.5)
+
+
+@pytest.mark.parametrize("name", ["bathe_down", "bathe_up"])
+def test_an_arm_is_bathed_on_the_side_of_the_robot(name):
+    """Wherever an itch would be: lifted is presented, and the place is 116 degrees around."""
+    at = poses(lift=45.0)
+    for around in (45.0, 135.0):
+        found = tasks.find_target(at, style(name), aim(0.5, around), tasks.first_progress(ALL))
+        assert found.presented
+        upper_end = at.shoulder if name == "bathe_down" else at.elbow
+        x, y, _ = np.asarray(at.upper_arm_rotation.T @ (found.place - upper_end))
+        assert np.degrees(np.arctan2(-y, -x)) == pytest.approx(115.6, abs=0.5)
 
 
 @pytest.mark.parametrize(
@@ -111,7 +128,7 @@ def test_a_head_turned_left_looks_to_the_persons_left():
 
 def scratched(*, press: float, offset=(0.0, 0.0, 0.0), last=(10.0, 10.0, 10.0), lift=45.0):
     """One step of scratching with the tool near the itch."""
-    own, drawn = style("scratch_upper_arm"), aim(0.5, 90.0)
+    own, drawn = style("scratch_upper_arm"), aim(0.5, 110.0)
     progress = tasks.first_progress(own)
     place = tasks.find_target(poses(lift=lift), own, drawn, progress).place
     now = poses(lift=lift, tool=np.asarray(place) + np.array(offset))
@@ -143,7 +160,7 @@ def test_no_stroke(case):
 
 @pytest.mark.parametrize(("name", "first"), [("bathe_down", 0.5), ("bathe_up", 19.5)])
 def test_bathing_goes_along_the_arm_point_by_point(name, first):
-    own, drawn, lifted = style(name), aim(0.5, 90.0), poses(lift=45.0)
+    own, drawn, lifted = style(name), aim(0.5, 110.0), poses(lift=45.0)
     progress = tasks.first_progress(own)
     ways = []
     for _ in range(4):
@@ -158,6 +175,29 @@ def test_bathing_goes_along_the_arm_point_by_point(name, first):
     expected = first * step - (tasks.UPPER_ARM if name == "bathe_up" else 0.0)
     assert ways[0] == pytest.approx(expected, abs=1e-5)
     np.testing.assert_allclose(np.diff(ways), step if name == "bathe_down" else -step, atol=1e-5)
+
+
+@pytest.mark.parametrize("name", ["bathe_down", "bathe_up"])
+def test_points_that_were_passed_by_are_lost(name):
+    own, drawn, progress = style(name), aim(0.5, 110.0), tasks.first_progress(style(name))
+
+    def touch(point, progress):
+        """A touch at one of the points, counted in the style's order."""
+        there = progress.replace(reached=jnp.array(point))
+        place = tasks.find_target(poses(lift=45.0), own, drawn, there).place
+        now = poses(lift=45.0, tool=place)
+        found = tasks.find_target(now, own, drawn, progress)
+        return tasks.advance(own, now, pressing(upper_arm=1.0), found, progress)
+
+    ahead = touch(5, progress)
+    assert (int(ahead.gained), int(ahead.progress.done), int(ahead.progress.reached)) == (1, 1, 6)
+    behind = touch(3, ahead.progress)
+    assert (int(behind.gained), int(behind.progress.reached)) == (0, 6)
+    again = touch(5, ahead.progress)
+    assert int(again.gained) == 0
+    last = touch(19, ahead.progress)
+    assert (int(last.gained), int(last.progress.done), int(last.progress.reached)) == (1, 2, 20)
+    assert int(touch(19, last.progress).gained) == 0
 
 
 def eaten(name: str, *, tilt: float, away: float = 0.0, turn: float = 35.0, left: int = 8):
@@ -244,6 +284,81 @@ def test_success_happens_once_with_the_point_that_makes_it(done, gained, happens
     target = tasks.find_target(at, style("bathe_up"), aim(), progress)
     counts = events.count_events(style("bathe_up"), pressing(), at, target, outcome)
     np.testing.assert_array_equal(counts[:, events.NAMES.index(events.SUCCESS)], [happens] * 2)
+
+
+def happened(name: str, at: Poses, body: Physics) -> list[set[str]]:
+    """Names of the ego's and the partner's events in a step in which nothing was done."""
+    own, progress = style(name), tasks.first_progress(style(name))
+    target = tasks.find_target(at, own, aim(0.5, 116.0), progress)
+    outcome = tasks.Outcome(progress, jnp.zeros((), jnp.int32), jnp.zeros((), jnp.int32))
+    counts = np.asarray(events.count_events(own, body, at, target, outcome))
+    assert set(np.unique(counts)) <= {0.0, 1.0}
+    return [{events.NAMES[i] for i in np.flatnonzero(agent)} for agent in counts]
+
+
+def test_events_say_what_robot_and_person_do():
+    assert happened("scratch_upper_arm", poses(tool=(1, 1, 1)), pressing()) == [set(), set()]
+    lifted = poses(lift=45.0)
+    middle = (np.asarray(lifted.elbow) + np.asarray(lifted.wrist)) / 2
+    pressed = happened(
+        "scratch_upper_arm", poses(lift=45.0, tool=middle, tilt=40.0), pressing(forearm=2.0)
+    )
+    assert pressed == [
+        {"tool_near@forearm", "touch@forearm", "tool_tilted"},
+        {"arm_lifted", "target_presented"},
+    ]
+    upper = (np.asarray(lifted.shoulder) + np.asarray(lifted.elbow)) / 2
+    aside = upper + np.array([0.0, -0.09, 0.0])
+    assert happened("bathe_up", poses(lift=45.0, tool=aside), pressing(upper_arm=1.0))[0] == {
+        "tool_near@upper_arm",
+        "touch@upper_arm",
+    }
+    mouth = np.asarray(poses(turn=-35.0).mouth) - np.array([0.0, 0.09, 0.0])
+    fed = happened("feed_right", poses(turn=-35.0, tool=mouth), pressing(head=1.0))
+    assert fed == [{"tool_near@mouth", "touch@head"}, {"head_right", "target_presented"}]
+    assert happened("feed_right", poses(turn=35.0, tool=(1, 1, 1)), pressing()) == [
+        set(),
+        {"head_left"},
+    ]
+
+
+@pytest.mark.parametrize(
+    ("name", "gained", "spilt", "event"),
+    [
+        ("scratch_forearm", 1, 0, "stroke"),
+        ("bathe_down", 1, 0, "wipe"),
+        ("feed_left", 1, 0, "portion_eaten"),
+        ("feed_left", 0, 1, "portion_spilt"),
+        ("drink_right", 1, 0, "unit_drunk"),
+    ],
+)
+def test_what_is_done_is_an_event_of_both(name, gained, spilt, event):
+    own, at = style(name), poses(tool=(1, 1, 1))
+    progress = tasks.first_progress(own)
+    outcome = tasks.Outcome(progress, jnp.array(gained), jnp.array(spilt))
+    target = tasks.find_target(at, own, aim(), progress)
+    counts = events.count_events(own, pressing(), at, target, outcome)
+    assert [[events.NAMES[i] for i in np.flatnonzero(row)] for row in counts] == [[event]] * 2
+
+
+@pytest.mark.parametrize(
+    ("name", "away", "tilt", "error"),
+    [
+        ("feed_left", 0.5, 20.0, 0.0),
+        ("feed_left", 0.5, 50.0, 20.0),
+        ("drink_left", 0.5, 0.0, 0.0),
+        ("drink_left", 0.05, 30.0, 15.0),
+        ("drink_left", 0.05, 110.0, 10.0),
+        ("drink_left", 0.05, 60.0, 0.0),
+        ("scratch_forearm", 0.0, 90.0, 0.0),
+    ],
+)
+def test_the_tilt_that_a_task_needs(name, away, tilt, error):
+    own = style(name)
+    mouth = np.asarray(poses(turn=35.0).mouth)
+    at = poses(turn=35.0, tilt=tilt, tool=mouth - np.array([0.0, away, 0.0]))
+    target = tasks.find_target(at, own, aim(), tasks.first_progress(own))
+    assert np.degrees(tasks.tilt_error(own, at, target)) == pytest.approx(error, abs=1e-3)
 
 
 def test_styles_of_some_tasks():

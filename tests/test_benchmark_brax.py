@@ -76,6 +76,12 @@ def test_games_are_judged_by_their_whole_return():
     assert returns == pytest.approx(-5 * (0.04 + 0.01), rel=1e-5)
 
 
+def test_devices_that_cannot_share_the_games_equally_are_refused(monkeypatch):
+    monkeypatch.setattr(jax, "local_device_count", lambda: 3)
+    with pytest.raises(ValueError, match="there are 3 devices; expected a divisor of 8"):
+        benchmark_brax.learner_config("assistive/jaco", 100_000)
+
+
 def test_the_first_piece_is_not_timed():
     assert benchmark_brax.without_compilation([100.0, 101.0, 103.0, 104.0]) == pytest.approx(16 / 3)
 

@@ -23,6 +23,8 @@ START_SPREAD = 0.08
 """Standard deviation of the joints' angles at a game's start, rad."""
 LARGEST_SEAT_SPREAD = 0.2
 """Beyond which the robot could not reach the person everywhere, m."""
+LARGEST_POSTURE_SPREAD = 0.13
+"""Beyond which some persons could not lift the arm far enough to present it, rad."""
 RANDOM_SPREAD = 0.4
 """The same of the robot's at a random moment of a game (training only)."""
 
@@ -36,6 +38,7 @@ class State(PyTreeNode):
         progress: of the task.
         tool: where the tool's tip is, m [3].
         effort: how far the person is from presenting the target, about rad [].
+        habit: by how much the joints' ranges are shifted in this game, rad [joint].
         time: steps taken, int32 [].
     """
 
@@ -44,6 +47,7 @@ class State(PyTreeNode):
     progress: Progress
     tool: jax.Array
     effort: jax.Array
+    habit: jax.Array
     time: jax.Array
 
 
@@ -58,7 +62,9 @@ class Assistive:
         tool: `universal`, one tool for all tasks, or `per_task`, which tells the ego by the tool
             in its hand what the task is. Assistive Gym has this and `reveal_target`.
         seat_spread: how far the person may sit from the usual place in each direction, m; drawn
-            for each game.
+            for each game. Without it players learn motions by heart.
+        posture_spread: how far the ranges of the person's joints may be shifted, rad; drawn for
+            each game. Without it an ego knows only the posture that its own partner prefers.
         still: `ego` or `partner`, whose actions then count for nothing, to learn what the other
             one can do alone; None where both act.
         reward: weights of the reward's terms.
@@ -69,7 +75,8 @@ class Assistive:
     tasks: tuple[str, ...] = TASKS
     reveal_target: bool = False
     tool: Literal["universal", "per_task"] = "universal"
-    seat_spread: float = 0.0
+    seat_spread: float = 0.05
+    posture_spread: float = 0.09
     still: Literal["ego", "partner"] | None = None
     reward: RewardWeights = dataclasses.field(default_factory=RewardWeights)
     shaping: ShapingWeights = dataclasses.field(default_factory=ShapingWeights)
@@ -91,6 +98,11 @@ class Assistive:
         if not 0.0 <= self.seat_spread <= LARGEST_SEAT_SPREAD:
             raise ValueError(
                 f"seat_spread is {self.seat_spread}; expected 0 to {LARGEST_SEAT_SPREAD} m"
+            )
+        if not 0.0 <= self.posture_spread <= LARGEST_POSTURE_SPREAD:
+            raise ValueError(
+                f"posture_spread is {self.posture_spread}; expected 0 to "
+                f"{LARGEST_POSTURE_SPREAD} rad"
             )
         if self.max_steps < 1:
             raise ValueError(f"max_steps is {self.max_steps}; expected at least 1")
@@ -171,10 +183,10 @@ class Assistive:
             key: consumed.
             style: the partner's style; what the robot sees of the start does not depend on it.
         """
-        angle_key, seat_key, aim_key = jax.random.split(key, 3)
+        angle_key, person_key, aim_key = jax.random.split(key, 3)
         noise = START_SPREAD * jax.random.normal(angle_key, (len(model.JOINTS),))
         angles = jnp.asarray(model.HOME) + noise
-        return self._shown(self._begin(angles, seat_key, aim_key, style), style)
+        return self._shown(self._begin(angles, person_key, aim_key, style), style)
 
     def training_reset(
         self, key: jax.Array, style: Style, random_share: jax.Array | float
@@ -185,23 +197,24 @@ class Assistive:
         home and a random place in the style's ranges, some of the time is over, and an arm is
         bathed in part.
         """
-        share_key, angle_key, moment_key, seat_key, aim_key = jax.random.split(key, 5)
+        share_key, angle_key, moment_key, person_key, aim_key = jax.random.split(key, 5)
         random = jax.random.uniform(share_key) < random_share
-        time_key, done_key, robot_key, person_key, depth_key = jax.random.split(moment_key, 5)
+        time_key, done_key, robot_key, pose_key, depth_key = jax.random.split(moment_key, 5)
         robot = RANDOM_SPREAD * jax.random.normal(robot_key, (len(model.ARM),))
         lowest, highest = style.ranges[len(model.ARM) :].T
-        person = jax.random.uniform(person_key, lowest.shape, minval=lowest, maxval=highest)
+        person = jax.random.uniform(pose_key, lowest.shape, minval=lowest, maxval=highest)
         home = jnp.asarray(model.HOME)
         depth = jax.random.uniform(depth_key)
         anywhere = jnp.concatenate([robot, depth * (person - home[len(model.ARM) :])])
         nearby = START_SPREAD * jax.random.normal(angle_key, (len(model.JOINTS),))
-        state = self._begin(home + jnp.where(random, anywhere, nearby), seat_key, aim_key, style)
+        state = self._begin(home + jnp.where(random, anywhere, nearby), person_key, aim_key, style)
         time = jax.random.randint(time_key, (), 0, 3 * self.max_steps // 4)
         done = jax.random.randint(done_key, (), 0, tasks.STEPS_OF_BATHING)
         state = state.replace(
             time=jnp.where(random, time, 0),
             progress=state.progress.replace(
-                done=jnp.where(random & tasks.is_bathing(style), done, state.progress.done)
+                done=jnp.where(random & tasks.is_bathing(style), done, 0),
+                reached=jnp.where(random & tasks.is_bathing(style), done, 0),
             ),
         )
         return self._shown(state, style)
@@ -226,7 +239,8 @@ class Assistive:
         if self.still is not None:
             actions = actions._replace(**{self.still: jnp.zeros_like(getattr(actions, self.still))})
         wanted = jnp.clip(jnp.concatenate([actions.ego, actions.partner]), -1.0, 1.0)
-        velocities = control.velocities(state.body, wanted, style.ranges)
+        ranges = style.ranges + state.habit[:, None]
+        velocities = control.velocities(state.body, wanted, ranges)
         body = physics.step(state.body, velocities)
         poses = physics.poses(body)
         target = tasks.find_target(poses, style, state.aim, state.progress)
@@ -248,9 +262,11 @@ class Assistive:
             progress=outcome.progress,
             tool=poses.tool,
             effort=following.effort,
+            habit=state.habit,
             time=state.time + 1,
         )
         shown = self.shaping.present * (state.effort - following.effort)
+        shown -= self.shaping.hold * following.effort
         tilted = -self.shaping.level * tasks.tilt_error(style, poses, target)
         timestep = TimeStep(
             observation=self._observe(after, poses, following, style),
@@ -273,16 +289,19 @@ class Assistive:
                 raise ValueError(f"the {name}'s action is {action}; expected finite numbers")
 
     def _begin(
-        self, angles: jax.Array, seat_key: jax.Array, aim_key: jax.Array, style: Style
+        self, angles: jax.Array, person_key: jax.Array, aim_key: jax.Array, style: Style
     ) -> State:
         """A game that begins at rest; `_shown` fills in what follows from the angles."""
-        seat = self.seat_spread * jax.random.uniform(seat_key, (3,), minval=-1.0, maxval=1.0)
+        habit_key, seat_key = jax.random.split(person_key)
+        habit = jax.random.uniform(habit_key, (len(model.PERSON),), minval=-1.0, maxval=1.0)
+        seat = jax.random.uniform(seat_key, (3,), minval=-1.0, maxval=1.0)
         return State(
-            body=physics.at_rest(angles, seat),
+            body=physics.at_rest(angles, self.seat_spread * seat),
             aim=tasks.draw_aim(aim_key),
             progress=tasks.first_progress(style),
             tool=jnp.zeros(3),
             effort=jnp.zeros(()),
+            habit=jnp.concatenate([jnp.zeros(len(model.ARM)), self.posture_spread * habit]),
             time=jnp.zeros((), jnp.int32),
         )
 

@@ -24,7 +24,7 @@ JOINTS = (*ARM, *PERSON)
 """All joints in the model's order."""
 SEATED = ("torso", "shoulder_lift", "head_pitch")
 """The bodies that the person's seat carries."""
-HOME = np.radians([211.4, 253.2, 216.7, 93.0, 166.2, 97.6, 38.0, 15.0, 0.0, 0.0, -60.0, 0.0, 0.0])
+HOME = np.radians([211.4, 253.2, 216.7, 93.0, 166.2, 97.6, 38.0, 15.0, 0.0, 0.0, -15.0, 0.0, 0.0])
 """Angles from which games start: a level tool in front of the person's right shoulder (rad)."""
 CONTROL_SECONDS = 0.1
 """Time of one step of a game."""

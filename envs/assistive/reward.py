@@ -38,11 +38,13 @@ class ShapingWeights:
 
     Attributes:
         present: what the person earns for each radian by which it comes nearer to presenting.
+        hold: what the person loses in a step for each radian that it is from presenting.
         level: what the robot loses in a step for each radian by which the tool tilts more than
             its task allows, or less than pouring needs at the mouth.
     """
 
     present: float = 1.7
+    hold: float = 0.1
     level: float = 0.033
 
 

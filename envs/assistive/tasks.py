@@ -1,11 +1,12 @@
 """The four tasks: what the tool must do where, and when the person presents it.
 
 Neither player succeeds alone: nothing counts unless the person presents the target, its arm
-lifted and the place turned to the robot, or its head turned as its style wants it; and only the
+lifted and an itch turned to the robot, or its head turned as its style wants it; and only the
 robot has the tool.
 """
 
 import math
+from typing import NamedTuple
 
 import jax
 import jax.numpy as jnp
@@ -20,11 +21,13 @@ UPPER_ARM, FOREARM = 0.279, 0.257
 """Lengths of the person's limbs, m."""
 UPPER_ARM_RADIUS, FOREARM_RADIUS = 0.043, 0.033
 ROBOT = np.array([-0.35, -0.3, 0.6355])
-"""The robot's shoulder: where the person turns a place to be seen, m."""
+"""The robot's shoulder: to where the person turns an itch, and from where it is bathed, m."""
 
 LIFTED = math.radians(30.0)
-FACING = math.cos(math.radians(60.0))
-HEAD_TOLERANCE = math.radians(10.0)
+"""How far an arm is lifted, at least, when it is presented, rad."""
+FACING, HEAD_TOLERANCE = math.radians(20.0), math.radians(10.0)
+"""How far, around a limb, a presented itch is from the side that the robot is on, and a presented
+mouth from where its style turns it, rad."""
 
 AT_SKIN, AT_MOUTH = 0.025, 0.03
 """How near the tool's tip must be to a place on the skin, and to the mouth, m."""
@@ -39,9 +42,9 @@ STEPS_OF_BATHING = 20
 """Points along the arm."""
 PORTIONS, UNITS = 8, 64
 """What the tool holds of food and of drink at the start."""
-ITCHES = (math.radians(30.0), math.radians(150.0))
-"""Where around a limb an itch may be, all of which the person can turn to the robot; 0 is the
-person's right, 90 degrees the front (rad)."""
+ITCHES = (0.45, 0.55), (math.radians(45.0), math.radians(135.0))
+"""Where along a limb an itch may be, 0 upper end to 1 lower end, and around it, where the person
+can turn all of it to the robot; 0 is the person's right, 90 degrees the front (rad)."""
 
 BONUS = {"scratch": 5.0, "bathe": 5.0, "feed": 20.0, "drink": 10.0}
 """Pay for a stroke, a new point, a portion, a unit."""
@@ -55,7 +58,7 @@ class Aim(PyTreeNode):
 
     Attributes:
         along: where along the limb the itch is, 0 upper end to 1 lower end, float32 [].
-        around: where around the limb the itch, or the line to bathe, is, rad [].
+        around: where around the limb the itch is, rad [].
     """
 
     along: jax.Array
@@ -67,11 +70,14 @@ class Progress(PyTreeNode):
 
     Attributes:
         done: strokes, points, portions or units so far, int32 [].
+        reached: the point of the arm from which on it is to be bathed; those that were passed by
+            are lost, int32 [].
         left: what the tool still holds, int32 [].
         stroke: where the last stroke ended, in the limb's frame, m [3].
     """
 
     done: jax.Array
+    reached: jax.Array
     left: jax.Array
     stroke: jax.Array
 
@@ -84,12 +90,15 @@ class Target(PyTreeNode):
         presented: whether the person presents it, bool [].
         effort: how far the person is from presenting it, 0 when it does, about rad [].
         tip: the tool's tip in the frame of the limb that has the target, m [3].
+        point: the first point to bathe that the tip is at, `STEPS_OF_BATHING` where it is at none,
+            int32 [].
     """
 
     place: jax.Array
     presented: jax.Array
     effort: jax.Array
     tip: jax.Array
+    point: jax.Array
 
 
 class Outcome(PyTreeNode):
@@ -110,47 +119,94 @@ def draw_aim(key: jax.Array) -> Aim:
     """Draws the aim of a game; consumes `key`."""
     along_key, around_key = jax.random.split(key)
     return Aim(
-        along=jax.random.uniform(along_key, minval=0.15, maxval=0.85),
-        around=jax.random.uniform(around_key, minval=ITCHES[0], maxval=ITCHES[1]),
+        along=jax.random.uniform(along_key, minval=ITCHES[0][0], maxval=ITCHES[0][1]),
+        around=jax.random.uniform(around_key, minval=ITCHES[1][0], maxval=ITCHES[1][1]),
     )
 
 
 def first_progress(style: Style) -> Progress:
     """Nothing is done and the tool is full; the first stroke may be anywhere."""
     holds = jnp.array([0, 0, PORTIONS, UNITS], jnp.int32)
-    return Progress(jnp.zeros((), jnp.int32), holds[style.task], jnp.full(3, 10.0))
+    nothing = jnp.zeros((), jnp.int32)
+    return Progress(nothing, nothing, holds[style.task], jnp.full(3, 10.0))
 
 
 def find_target(poses: Poses, style: Style, aim: Aim, progress: Progress) -> Target:
     """Where the tool is wanted now, and whether the person presents it."""
-    mouth = at_mouth(style)
-    point = jnp.minimum(progress.done, STEPS_OF_BATHING - 1)
-    way = (jnp.where(style.downwards, point, STEPS_OF_BATHING - 1 - point) + 0.5) / STEPS_OF_BATHING
-    way = way * (UPPER_ARM + FOREARM)
-    bathing = is_bathing(style)
-    on_forearm = jnp.where(bathing, way > UPPER_ARM, style.forearm)
-    bathed = jnp.where(on_forearm, way - UPPER_ARM, way)
-    itching = aim.along * jnp.where(on_forearm, FOREARM, UPPER_ARM)
-    down = jnp.where(bathing, bathed, itching)
-    radius = jnp.where(on_forearm, FOREARM_RADIUS, UPPER_ARM_RADIUS)
-    # In a limb's frame -x is the person's right and -y its front; the limb hangs along -z.
-    normal = jnp.stack([-jnp.cos(aim.around), -jnp.sin(aim.around), jnp.zeros(())])
-    origin = jnp.where(on_forearm, poses.elbow, poses.shoulder)
-    rotation = jnp.where(on_forearm, poses.forearm_rotation, poses.upper_arm_rotation)
-    place = origin + rotation @ (radius * normal - down * jnp.array([0.0, 0.0, 1.0]))
+    mouth, bathing = at_mouth(style), is_bathing(style)
+    points = jnp.arange(STEPS_OF_BATHING)
+    in_turn = jnp.where(style.downwards, points, STEPS_OF_BATHING - 1 - points)
+    ways = (in_turn + 0.5) / STEPS_OF_BATHING * (UPPER_ARM + FOREARM)
+    line = jax.vmap(lambda way: _on_arm(poses, way).place)(ways)
+    at = (jnp.linalg.norm(poses.tool - line, axis=1) < AT_SKIN) & (points >= progress.reached)
+    bathed = _on_arm(poses, ways[jnp.minimum(progress.reached, STEPS_OF_BATHING - 1)])
+    down = aim.along * jnp.where(style.forearm, FOREARM, UPPER_ARM)
+    itching = _on_skin(poses, style.forearm, down, aim.around)
+    both = zip(bathed, itching, strict=True)
+    skin = _Skin(*(jnp.where(bathing, one, other) for one, other in both))
 
-    to_robot = ROBOT - place
-    facing = jnp.dot(rotation @ normal, to_robot) / jnp.linalg.norm(to_robot)
     lift = jnp.arccos(jnp.clip(poses.upper_arm_rotation[2, 2], -0.9999, 0.9999))
-    arm_effort = jnp.maximum(LIFTED - lift, 0.0) + jnp.maximum(FACING - facing, 0.0)
+    arm_effort = jnp.maximum(LIFTED - lift, 0.0) + jnp.maximum(skin.turned_away - FACING, 0.0)
     turn = head_turn(poses)
     head_effort = jnp.maximum(jnp.abs(turn - style.head_turn) - HEAD_TOLERANCE, 0.0)
     effort = jnp.where(mouth, head_effort, arm_effort)
     return Target(
-        place=jnp.where(mouth, poses.mouth, place),
+        place=jnp.where(mouth, poses.mouth, skin.place),
         presented=effort <= 0.0,
         effort=effort,
-        tip=rotation.T @ (poses.tool - origin),
+        tip=skin.rotation.T @ (poses.tool - skin.origin),
+        point=jnp.where(at.any(), jnp.argmax(at), STEPS_OF_BATHING),
+    )
+
+
+class _Skin(NamedTuple):
+    """A place on the skin of the arm.
+
+    Attributes:
+        place: m [3].
+        origin: upper end of its limb, m [3].
+        rotation: of its limb [3, 3].
+        turned_away: how far around the limb it is from the robot's side, rad [].
+    """
+
+    place: jax.Array
+    origin: jax.Array
+    rotation: jax.Array
+    turned_away: jax.Array
+
+
+def _on_arm(poses: Poses, way: jax.Array) -> _Skin:
+    """The place on the robot's side of the arm, `way` m from the shoulder."""
+    on_forearm = way > UPPER_ARM
+    return _on_skin(poses, on_forearm, jnp.where(on_forearm, way - UPPER_ARM, way), None)
+
+
+def _on_skin(
+    poses: Poses, on_forearm: jax.Array, down: jax.Array, around: jax.Array | None
+) -> _Skin:
+    """A place on the skin.
+
+    Args:
+        poses: of the person.
+        on_forearm: whether it is on the forearm, not the upper arm, bool [].
+        down: how far from the limb's upper end it is, m [].
+        around: where around the limb it is, rad []; None for the robot's side.
+    """
+    origin = jnp.where(on_forearm, poses.elbow, poses.shoulder)
+    rotation = jnp.where(on_forearm, poses.forearm_rotation, poses.upper_arm_rotation)
+    middle = origin - down * rotation[:, 2]
+    # In a limb's frame -x is the person's right and -y its front; the limb hangs along -z.
+    to_robot = rotation.T @ (ROBOT - middle)
+    robot_side = jnp.arctan2(-to_robot[1], -to_robot[0])
+    around = robot_side if around is None else around
+    apart = jnp.abs(robot_side - around)
+    normal = jnp.stack([-jnp.cos(around), -jnp.sin(around), jnp.zeros(())])
+    radius = jnp.where(on_forearm, FOREARM_RADIUS, UPPER_ARM_RADIUS)
+    return _Skin(
+        place=middle + radius * rotation @ normal,
+        origin=origin,
+        rotation=rotation,
+        turned_away=jnp.minimum(apart, 2 * jnp.pi - apart),
     )
 
 
@@ -164,7 +220,7 @@ def advance(
     at_skin, at_lips = distance < AT_SKIN, distance < AT_MOUTH
     moved = jnp.linalg.norm(target.tip - progress.stroke) > STROKE
     stroke = touching & at_skin & (force < GENTLE) & moved
-    point = touching & at_skin & (progress.done < STEPS_OF_BATHING)
+    point = touching & (target.point < STEPS_OF_BATHING)
     held = progress.left > 0
     tilted = tilt(poses)
     spilt = _is(style, "feed") & held & (tilted > SPILL)
@@ -174,6 +230,7 @@ def advance(
     used = spilt | (gained & at_mouth(style))
     after = Progress(
         done=progress.done + gained,
+        reached=jnp.where(gained & is_bathing(style), target.point + 1, progress.reached),
         left=progress.left - used,
         stroke=jnp.where(gained, target.tip, progress.stroke),
     )
