@@ -309,3 +309,5 @@ def test_shipped_models_earn_most_of_the_oracles_return(environment):
     found = measure(model, sentences, games=2, seed=0)["mean"]
     assert found["share_of_oracle"] > 0.7, found
     assert found["accuracy"] > 0.7, found
+    if model.env.success_event is not None:
+        assert found["success"] > 0.7, found
