@@ -57,7 +57,7 @@ def init_train_state(
     """Starts the games of one pair; `key` is consumed here and by the training."""
     reset_key, train_key = jax.random.split(key)
     keys = jax.random.split(reset_key, config.num_envs)
-    states, timesteps = _over_games(_restart(env, config.random_start), style)(keys)
+    states, timesteps = over_games(restart(env, config.random_start), style)(keys)
     return TrainState(
         update=jnp.zeros((), jnp.int32),
         key=train_key,
@@ -100,23 +100,17 @@ def _update(
     """One rollout and the learning from it."""
     progress = state.update / config.num_updates
     rollout_key = jax.random.fold_in(state.key, state.update)
-    confined = _confine(env, style)
+    confined = confine(env, style)
     bound = progress < config.confined_until
     style_now = jax.tree.map(lambda held, free: jnp.where(bound, held, free), confined, style)
-    remaining = (1 - progress) / (1 - config.random_start_until)
-    random_share = config.final_random_start + jnp.minimum(1.0, remaining) * (
-        config.random_start - config.final_random_start
-    )
-    state, steps = _rollout(env, config, state, style_now, rollout_key, random_share)
+    share = random_share(config, progress)
+    state, steps = _rollout(env, config, state, style_now, rollout_key, share)
 
     actors, critic = make_networks(env)
-    shaping = config.shaping * jnp.maximum(0.0, 1 - progress / config.shaping_until)
-    scaled = config.reward_scale * (
-        steps["reward"] + shaping * jnp.moveaxis(steps["shaped"], -1, 0)
-    )
+    scaled = scaled_rewards(config, progress, steps)
     rates = {
-        "learning_rate": _falling(config.learning_rate, config.final_learning_rate, progress),
-        "entropy_weight": _falling(config.entropy, config.final_entropy, progress),
+        "learning_rate": falling(config.learning_rate, config.final_learning_rate, progress),
+        "entropy_weight": falling(config.entropy, config.final_entropy, progress),
     }
     losses = []
     for agent, role in enumerate(("ego", "partner")):
@@ -134,18 +128,46 @@ def _update(
             learner = learner.replace(normaliser=seen)
         state = state.replace(**{role: learner})
         losses.append(loss)
+    return state.replace(update=state.update + 1), metrics_of(env, steps, jnp.stack(losses))
+
+
+def metrics_of(env: Environment, steps: dict[str, Any], losses: jax.Array) -> dict[str, jax.Array]:
+    """Metrics of one update; see `train_chunk`."""
     by_rule = jnp.any(steps["terminated"])
     game_steps = jnp.where(by_rule, 1 / jnp.mean(steps["ended"]), env.max_steps)
-    metrics = {
+    return {
         "reward": jnp.mean(steps["reward"]),
         "return": jnp.mean(steps["reward"]) * game_steps,
         "shaped": jnp.mean(steps["shaped"]),
-        "loss": jnp.mean(jnp.stack(losses)),
+        "loss": jnp.mean(losses),
     }
-    return state.replace(update=state.update + 1), metrics
 
 
-def _over_games(function: Callable[..., Any], style: Any) -> Callable[..., Any]:
+def scaled_rewards(config: PPOConfig, progress: jax.Array, steps: dict[str, Any]) -> jax.Array:
+    """What the players learn from: the team's reward and what is left of the shaped ones.
+
+    Args:
+        config: settings.
+        progress: of the training, 0 to 1.
+        steps: of a rollout, leading axes [T, env].
+
+    Returns:
+        [agent, T, env].
+    """
+    shaping = config.shaping * jnp.maximum(0.0, 1 - progress / config.shaping_until)
+    shaped = jnp.moveaxis(steps["shaped"], -1, 0)
+    return config.reward_scale * (steps["reward"] + shaping * shaped)
+
+
+def random_share(config: PPOConfig, progress: jax.Array) -> jax.Array:
+    """The share of games that start at a random moment now."""
+    remaining = (1 - progress) / (1 - config.random_start_until)
+    return config.final_random_start + jnp.minimum(1.0, remaining) * (
+        config.random_start - config.final_random_start
+    )
+
+
+def over_games(function: Callable[..., Any], style: Any) -> Callable[..., Any]:
     """Maps a function of (style, one game's arguments) over all games, leading axis [env]."""
     if not isinstance(style, StylesByGame):
         return jax.vmap(partial(function, style))
@@ -162,17 +184,20 @@ def _over_games(function: Callable[..., Any], style: Any) -> Callable[..., Any]:
     return mapped
 
 
-def _restart(env: Environment, random_share: jax.Array | float) -> Callable[..., Any]:
+def restart(env: Environment, random_share: jax.Array | float) -> Callable[..., Any]:
+    """Starts a game of (style, key); some games go on from a random moment."""
     return lambda style, key: env.training_reset(key, style, random_share)
 
 
-def _confine(env: Environment, style: Any) -> Any:
+def confine(env: Environment, style: Any) -> Any:
+    """The style, or `StylesByGame`, with the ego held to its role."""
     if isinstance(style, StylesByGame):
         return StylesByGame(jax.vmap(env.confine)(style.styles))
     return env.confine(style)
 
 
-def _falling(start: float, end: float, progress: jax.Array) -> jax.Array:
+def falling(start: float, end: float, progress: jax.Array) -> jax.Array:
+    """What falls linearly from `start` to `end`."""
     return start + (end - start) * progress
 
 
@@ -190,9 +215,9 @@ def _rollout(
     if isinstance(state.partner, Learner):
         partner = partial(_distribution, actors.partner, state.partner)
     else:
-        partner = partial(_frozen_partners, actors.partner, config.partner_noise, state.partner)
-    play = _over_games(lambda style, key, game, actions: env.step(key, game, actions, style), style)
-    restart_all = _over_games(_restart(env, random_share), style)
+        partner = partial(frozen_partners, actors.partner, config.partner_noise, state.partner)
+    play = over_games(lambda style, key, game, actions: env.step(key, game, actions, style), style)
+    restart_all = over_games(restart(env, random_share), style)
 
     def one_step(carry, step_key):
         states, observations = carry
@@ -208,7 +233,7 @@ def _rollout(
         fresh, first = restart_all(jax.random.split(reset_key, config.num_envs))
         done = timesteps.done
 
-        def restart(new, old):
+        def renewed(new, old):
             return jnp.where(done.reshape(-1, *[1] * (old.ndim - 1)), new, old)
 
         kept = {
@@ -220,8 +245,8 @@ def _rollout(
             "ended": done,
             "terminated": timesteps.terminated,
         }
-        states = jax.tree.map(restart, fresh, following)
-        observations = jax.tree.map(restart, first.observation, timesteps.observation)
+        states = jax.tree.map(renewed, fresh, following)
+        observations = jax.tree.map(renewed, first.observation, timesteps.observation)
         return (states, observations), kept
 
     carry = (state.env_states, state.observations)
@@ -236,9 +261,7 @@ def _distribution(actor: MLPActor, learner: Learner, observation: jax.Array) -> 
     return actor.apply(learner.actor, normalisation.normalise(learner.normaliser, observation))
 
 
-def _frozen_partners(
-    actor: MLPActor, noise: float, policies: Policy, observation: jax.Array
-) -> Any:
+def frozen_partners(actor: MLPActor, noise: float, policies: Policy, observation: jax.Array) -> Any:
     """Each of the frozen partners plays an equal share of the games, with trembling hands."""
     num_partners = jax.tree.leaves(policies)[0].shape[0]
     shared = observation.reshape(num_partners, -1, observation.shape[-1])

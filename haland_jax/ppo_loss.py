@@ -144,14 +144,27 @@ def ppo_loss(
     config: PPOConfig,
     entropy_weight: jax.Array,
 ) -> jax.Array:
-    """Clipped surrogate, value loss and entropy bonus, mean over the batch.
-
-    `actor` and `critic` are the Linen modules of the two parameter trees. Schulman et al. (2017),
-    Eq. 7 and 9; advantages are normalised over the minibatch.
-    """
+    """The loss of one minibatch; `actor` and `critic` are the modules of the two trees."""
     actor_params, critic_params = params
     distribution = actor.apply(actor_params, batch.observation)
     value = critic.apply(critic_params, batch.observation)
+    return clipped_loss(distribution, value, batch, config, entropy_weight)
+
+
+def clipped_loss(
+    distribution: Any, value: jax.Array, batch: Batch, config: PPOConfig, entropy_weight: jax.Array
+) -> jax.Array:
+    """Clipped surrogate, value loss and entropy bonus, mean over the batch.
+
+    Schulman et al. (2017), Eq. 7 and 9; advantages are normalised over the minibatch.
+
+    Args:
+        distribution: of the actions, as the player would act now.
+        value: what it expects now, [...].
+        batch: what it did.
+        config: settings.
+        entropy_weight: of the bonus now.
+    """
     advantage = batch.advantage - jnp.mean(batch.advantage)
     advantage = advantage / (jnp.std(batch.advantage) + 1e-8)
     ratio = jnp.exp(networks.log_prob(distribution, batch.action) - batch.log_prob)

@@ -194,3 +194,10 @@ class RecurrentCritic(nn.Module):
         features, memory = RecurrentBody(name="body")(observation, told, began, memory)
         out = nn.Dense(1, kernel_init=nn.initializers.orthogonal(1.0), name="head")(features)
         return out[..., 0], memory
+
+
+def actor_of(params: Any) -> RecurrentActor:
+    """The `RecurrentActor` whose parameters these are (of any leading axes)."""
+    own = params["params"]
+    kind = DistributionKind.GAUSSIAN if "log_std" in own else DistributionKind.CATEGORICAL
+    return RecurrentActor(own["head"]["bias"].shape[-1], kind)

@@ -1,4 +1,7 @@
-"""Playing a pair of policies: returns, events, observations and states of whole games."""
+"""Playing a pair: returns, events, observations and states of whole games.
+
+The partner is a policy. The ego is a policy too, or an `Agent`, which may remember.
+"""
 
 from typing import Any
 
@@ -8,7 +11,63 @@ from flax.struct import PyTreeNode
 
 from envs.base import Environment, Pair
 from haland_jax import networks
-from haland_jax.networks import Policy
+from haland_jax.networks import Distribution, Policy
+
+
+class Agent(PyTreeNode):
+    """An ego that may remember what it has seen and what its partner has done.
+
+    Subclasses hold its parameters; leading axes make a population of it, as of a policy.
+    """
+
+    def begin(self, num_games: int) -> Any:
+        """Returns its memory at the start of games, leading axis [G]."""
+        raise NotImplementedError
+
+    def act(
+        self, memory: Any, observation: jax.Array, partner_action: jax.Array
+    ) -> tuple[Distribution, Any]:
+        """Plays one step of the games.
+
+        Args:
+            memory: at this step.
+            observation: [G, O].
+            partner_action: the partner's last action as `shown_action` gives it, zeros at the
+                first step, [G, A].
+
+        Returns:
+            Action distributions [G, A], and the memory at the next step.
+        """
+        raise NotImplementedError
+
+
+class Reactive(Agent):
+    """A policy as an agent, which remembers nothing.
+
+    Attributes:
+        policy: parameters of an actor.
+    """
+
+    policy: Policy
+
+    def begin(self, num_games: int) -> tuple[()]:
+        """Returns nothing."""
+        del num_games
+        return ()
+
+    def act(
+        self, memory: tuple[()], observation: jax.Array, partner_action: jax.Array
+    ) -> tuple[Distribution, tuple[()]]:
+        """What the policy does on an observation."""
+        del partner_action
+        return networks.act(self.policy, observation), memory
+
+
+def shown_action(env: Environment, action: jax.Array) -> jax.Array:
+    """A partner's action as an agent is shown it: its one-hot, or the vector, [..., A]."""
+    if env.continuous:
+        return jnp.clip(action, -1.0, 1.0)
+    return jax.nn.one_hot(action, env.num_actions.partner)
 
 
 class Games(PyTreeNode):
@@ -46,7 +105,7 @@ class Recording(PyTreeNode):
 def play(
     env: Environment,
     key: jax.Array,
-    ego: Policy,
+    ego: Policy | Agent,
     partner: Policy,
     style: Any,
     *,
@@ -58,7 +117,7 @@ def play(
     Args:
         env: the environment.
         key: consumed.
-        ego: parameters of the ego's actor.
+        ego: parameters of the ego's actor, or an agent.
         partner: parameters of the partner's actor.
         style: the partner's style.
         num_games: games G, played in parallel.
@@ -75,10 +134,14 @@ def play(
         events=jnp.zeros((num_games, 2, num_events)),
     )
 
+    agent = ego if isinstance(ego, Agent) else Reactive(ego)
+
     def one_step(carry, step_key):
-        states, observations, alive, games = carry
+        states, observations, memory, shown, alive, games = carry
         act_key, env_key = jax.random.split(step_key)
-        actions = choose_actions(act_key, ego, partner, observations, greedy=greedy)
+        acting, memory = agent.act(memory, observations.ego, shown)
+        distributions = Pair(acting, networks.act(partner, observations.partner))
+        actions = draw_actions(act_key, distributions, greedy=greedy)
         env_keys = jax.random.split(env_key, num_games)
         states, timesteps = jax.vmap(env.step, in_axes=(0, 0, 0, None))(
             env_keys, states, actions, style
@@ -88,9 +151,13 @@ def play(
             lengths=games.lengths + alive,
             events=games.events + timesteps.events * alive[:, None, None],
         )
-        return (states, timesteps.observation, alive & ~timesteps.done, games), None
+        alive = alive & ~timesteps.done
+        shown = shown_action(env, actions.partner)
+        return (states, timesteps.observation, memory, shown, alive, games), None
 
-    carry = (states, timesteps.observation, jnp.ones(num_games, bool), games)
+    shown = jnp.zeros((num_games, env.num_actions.partner))
+    alive = jnp.ones(num_games, bool)
+    carry = (states, timesteps.observation, agent.begin(num_games), shown, alive, games)
     carry, _ = jax.lax.scan(one_step, carry, jax.random.split(play_key, env.max_steps))
     return carry[-1]
 
@@ -98,7 +165,7 @@ def play(
 def record(
     env: Environment,
     key: jax.Array,
-    ego: Policy,
+    ego: Policy | Agent,
     partner: Policy,
     style: Any,
     *,
@@ -115,26 +182,28 @@ def record(
     else:
         state, timestep = env.reset(reset_key, style)
 
+    agent = ego if isinstance(ego, Agent) else Reactive(ego)
+
     def one_step(carry, step_key):
-        state, observation, alive = carry
+        state, observation, memory, shown, alive = carry
         act_key, env_key = jax.random.split(step_key)
-        actions = choose_actions(act_key, ego, partner, observation, greedy=greedy)
+        acting, memory = agent.act(memory, observation.ego[None], shown[None])
+        acting = jax.tree.map(lambda leaf: leaf[0], acting)
+        distributions = Pair(acting, networks.act(partner, observation.partner))
+        actions = draw_actions(act_key, distributions, greedy=greedy)
         following, timestep = env.step(env_key, state, actions, style)
         reward = timestep.reward * alive
         kept = Recording(state, observation, actions, reward, alive)
-        return (following, timestep.observation, alive & ~timestep.done), kept
+        shown = shown_action(env, actions.partner)
+        return (following, timestep.observation, memory, shown, alive & ~timestep.done), kept
 
-    carry = (state, timestep.observation, jnp.ones((), bool))
+    shown = jnp.zeros(env.num_actions.partner)
+    carry = (state, timestep.observation, agent.begin(1), shown, jnp.ones((), bool))
     return jax.lax.scan(one_step, carry, jax.random.split(play_key, env.max_steps))[1]
 
 
-def choose_actions(
-    key: jax.Array, ego: Policy, partner: Policy, observations: Pair, *, greedy: bool = False
-) -> Pair:
-    """Draws both players' actions for observations with any leading axes; consumes `key`."""
-    distributions = Pair(
-        networks.act(ego, observations.ego), networks.act(partner, observations.partner)
-    )
+def draw_actions(key: jax.Array, distributions: Pair, *, greedy: bool = False) -> Pair:
+    """Draws both players' actions from what they would do, any leading axes; consumes `key`."""
     if greedy:
         return Pair(*(networks.mode(distribution) for distribution in distributions))
     keys = jax.random.split(key)

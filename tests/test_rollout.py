@@ -6,6 +6,7 @@ import numpy as np
 import pytest
 from toy_game import ToyGame, always
 
+from envs.base import Pair
 from haland_jax import rollout
 
 
@@ -70,7 +71,6 @@ def test_a_recording_holds_every_step_and_marks_the_end(game, style, length):
 
 
 def test_both_players_draw_with_keys_of_their_own():
-    even = [jax.tree.map(jnp.zeros_like, always(0, 2, size)) for size in (3, 4)]
-    observations = rollout.Pair(jnp.zeros((1000, 3)), jnp.zeros((1000, 4)))
-    ego, partner = rollout.choose_actions(jax.random.key(0), *even, observations)
+    even = Pair(jnp.zeros((1000, 2)), jnp.zeros((1000, 2)))
+    ego, partner = rollout.draw_actions(jax.random.key(0), even)
     assert abs(np.mean(np.asarray(ego) == np.asarray(partner)) - 0.5) < 0.08
