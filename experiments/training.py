@@ -69,27 +69,60 @@ def train_population(
     Raises:
         NonFiniteLoss: training diverged.
     """
-    members = jax.tree.leaves(styles)[0].shape[0]
+    styles = share_out(styles)
+
+    def compiled(updates: int) -> Callable[[TrainState], tuple[TrainState, dict[str, jax.Array]]]:
+        train = partners.compile_training(env, config, updates)
+        return lambda state: train(state, styles)
+
+    state, returns = train_in_pieces(config, start(), compiled, saver, report, stage)
+    return partners.trained_players(state), returns
+
+
+def train_in_pieces(
+    config: PPOConfig,
+    state: Any,
+    compiled: Callable[[int], Callable[[Any], tuple[Any, dict[str, jax.Array]]]],
+    saver: Saver,
+    report: Callable[[int, dict[str, float]], None],
+    stage: str,
+) -> tuple[Any, np.ndarray]:
+    """Trains a population of any kind to its end.
+
+    Args:
+        config: settings; `config.num_updates` is the length.
+        state: the initial states, leading axis [member], with the updates done in `update`.
+        compiled: makes the program that does some updates: state -> state, metrics.
+        saver: where interrupted training goes on from.
+        report: called with the updates done and the mean return.
+        stage: for messages.
+
+    Returns:
+        The final state, and the training games' mean return, [update, member].
+
+    Raises:
+        NonFiniteLoss: training diverged.
+    """
+    members = state.update.shape[0]
     returns = np.zeros((config.num_updates, members), np.float32)
-    state = start()
     saved = saver.restore({"state": state, "returns": returns})
     if saved is not None:
         state, returns = saved["state"], np.array(saved["returns"])
-    state, styles = share_out(state), share_out(styles)
-    compiled: dict[int, Callable[..., Any]] = {}
+    state = share_out(state)
+    programs: dict[int, Callable[[Any], tuple[Any, dict[str, jax.Array]]]] = {}
     done = int(np.asarray(state.update)[0])
     while done < config.num_updates:
         size = min(UPDATES_PER_PIECE, config.num_updates - done)
-        if size not in compiled:
-            compiled[size] = partners.compile_training(env, config, size)
-        state, metrics = compiled[size](state, styles)
+        if size not in programs:
+            programs[size] = compiled(size)
+        state, metrics = programs[size](state)
         metrics = {name: np.asarray(values).T for name, values in metrics.items()}
         fit.check_finite(stage, done, metrics)
         returns[done : done + size] = metrics["return"]
         done += size
         report(done, {"return": float(metrics["return"].mean())})
         saver.save_if_due({"state": state, "returns": returns})
-    return partners.trained_players(state), returns
+    return state, returns
 
 
 def run_fit(

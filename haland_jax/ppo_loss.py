@@ -92,9 +92,13 @@ class PPOConfig:
 
 
 class Batch(PyTreeNode):
-    """One player's experience; leading axes [T, env]."""
+    """One player's experience; leading axes [T, env].
 
-    observation: jax.Array
+    `observation` is all that the networks read: an array, or a tree of what a player with a
+    memory reads.
+    """
+
+    observation: Any
     action: jax.Array
     log_prob: jax.Array
     value: jax.Array

@@ -75,22 +75,23 @@ def _forwards(
     kernel: jax.Array, projected: jax.Array, keep: jax.Array, start: Memory
 ) -> tuple[jax.Array, Memory, _Kept]:
     def step(memory: Memory, now: tuple[jax.Array, jax.Array]):
-        gates, kept = now
-        memory = Memory(*(part * kept[:, None] for part in memory))
-        following, parts = _step(kernel, gates, memory)
-        return following, (following.hidden, _Kept(*parts, *memory, following.cell))
+        gates, going_on = now
+        memory = Memory(*(part * going_on[:, None] for part in memory))
+        following, kept = _step(kernel, gates, memory)
+        return following, (following.hidden, kept)
 
     last, (hidden, kept) = jax.lax.scan(step, start, (projected, keep))
     return hidden, last, kept
 
 
-def _step(kernel: jax.Array, projected: jax.Array, memory: Memory) -> tuple[Memory, Any]:
-    """One step of a memory, and its four gates."""
+def _step(kernel: jax.Array, projected: jax.Array, memory: Memory) -> tuple[Memory, _Kept]:
+    """One step of a memory, and what its gradient needs."""
     gates = jnp.split(projected + memory.hidden @ kernel, 4, axis=-1)
     entering, forgetting, leaving = (jax.nn.sigmoid(gates[index]) for index in (0, 1, 3))
     candidate = jnp.tanh(gates[2])
     cell = forgetting * memory.cell + entering * candidate
-    return Memory(cell, leaving * jnp.tanh(cell)), (entering, forgetting, candidate, leaving)
+    kept = _Kept(entering, forgetting, candidate, leaving, memory.cell, memory.hidden, cell)
+    return Memory(cell, leaving * jnp.tanh(cell)), kept
 
 
 def _remember_forwards(kernel: Any, projected: Any, keep: Any, start: Memory) -> Any:

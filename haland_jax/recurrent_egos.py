@@ -74,11 +74,13 @@ class UniversalEgo(Agent):
         kept, began = memory
         labels = jnp.broadcast_to(self.label, (len(observation), *self.label.shape))
         now = (observation, self.tells(labels, partner_action), began)
-        acting, kept = recurrent.actor_of(self.actor).apply(
-            self.actor, *(part[None] for part in now), kept
-        )
+        acting, kept = _apply(self.actor, *(part[None] for part in now), kept)
         acting = jax.tree.map(lambda leaf: leaf[0], acting)
         return acting, (kept, jnp.zeros_like(began))
+
+
+def _apply(actor: Any, *sequence: Any) -> Any:
+    return recurrent.actor_of(actor).apply(actor, *sequence)
 
 
 def raw_actor(actor: Any, normaliser: Normaliser | None) -> Any:
