@@ -184,9 +184,9 @@ def over_games(function: Callable[..., Any], style: Any) -> Callable[..., Any]:
     return mapped
 
 
-def restart(env: Environment, random_share: jax.Array | float) -> Callable[..., Any]:
+def restart(env: Environment, share: jax.Array | float) -> Callable[..., Any]:
     """Starts a game of (style, key); some games go on from a random moment."""
-    return lambda style, key: env.training_reset(key, style, random_share)
+    return lambda style, key: env.training_reset(key, style, share)
 
 
 def confine(env: Environment, style: Any) -> Any:
@@ -207,7 +207,7 @@ def _rollout(
     state: TrainState,
     style: Any,
     key: jax.Array,
-    random_share: jax.Array,
+    share: jax.Array,
 ) -> tuple[TrainState, dict[str, Any]]:
     """Plays `rollout_steps` steps of all games; finished games start anew."""
     actors, _ = make_networks(env)
@@ -217,7 +217,7 @@ def _rollout(
     else:
         partner = partial(frozen_partners, actors.partner, config.partner_noise, state.partner)
     play = over_games(lambda style, key, game, actions: env.step(key, game, actions, style), style)
-    restart_all = over_games(restart(env, random_share), style)
+    restart_all = over_games(restart(env, share), style)
 
     def one_step(carry, step_key):
         states, observations = carry

@@ -32,12 +32,6 @@ def no_memory(*leading: int) -> Memory:
     return Memory(jnp.zeros((*leading, UNITS)), jnp.zeros((*leading, UNITS)))
 
 
-def forget(memory: Memory, began: jax.Array) -> Memory:
-    """The memory [B, H] without what belongs to earlier games; `began` is bool [B]."""
-    keep = ~began[..., None]
-    return Memory(memory.cell * keep, memory.hidden * keep)
-
-
 class _Kept(NamedTuple):
     """What the gradient needs of a step, [T, B, H] each."""
 

@@ -88,8 +88,14 @@ def init_recurrent(
         Training states with leading axis [variant * seed].
 
     Raises:
-        ValueError: the partners cannot share the games in equal parts.
+        ValueError: the partners cannot share the games in equal parts, or the ego would be held
+            to a role.
     """
+    if config.confined_until > 0.0:
+        raise ValueError(
+            f"confined_until is {config.confined_until}; expected 0, since an ego for all styles "
+            "has no role to be held to"
+        )
     everyone = flatten(partners)
     count = jax.tree.leaves(everyone)[0].shape[0]
     ppo.expect_equal_shares("recurrent", config, count, "partners of all styles")
@@ -171,8 +177,8 @@ def _update(
     state, steps = _rollout(env, config, state, ppo.random_share(config, progress))
 
     ego = state.ego
-    seen = normalisation.normalise(ego.normaliser, steps["observations"].ego)
-    sequence = (seen, steps["told"], steps["began"])
+    played = normalisation.normalise(ego.normaliser, steps["observations"].ego)
+    sequence = (played, steps["told"], steps["began"])
     values, critic_memory = critic.apply(ego.critic, *sequence, memories[1])
     next_seen = normalisation.normalise(ego.normaliser, state.observations.ego)
     following = (next_seen, _told(env, state), state.began)
@@ -276,7 +282,7 @@ def _learn(
     learning_rate: jax.Array,
     entropy_weight: jax.Array,
 ) -> tuple[RecurrentLearner, jax.Array]:
-    """Some passes over the batch, in minibatches of games of all partners."""
+    """Some passes over the batch, in minibatches of games of all styles."""
     actor, critic = networks_of(env)
     optimizer = make_optimizer(config)
     minibatches = config.num_minibatches
@@ -314,24 +320,29 @@ def _learn(
     return learner, losses
 
 
-def egos_by_style(env: Environment, state: RecurrentState) -> dict[str, UniversalEgo]:
+def raw_actors(state: RecurrentState) -> Any:
+    """The actors of trained egos, which read raw observations, leading axis [variant * seed]."""
+    return jax.vmap(raw_actor)(state.ego.actor, state.ego.normaliser)
+
+
+def egos_by_style(env: Environment, actors: Any) -> dict[str, UniversalEgo]:
     """The agents that each variant is with partners of each style.
 
     Args:
         env: the environment.
-        state: trained egos, leading axis [variant * seed].
+        actors: what `raw_actors` returned.
 
     Returns:
         By variant, agents with leading axes [style, seed].
     """
-    raw = jax.vmap(raw_actor)(state.ego.actor, state.ego.normaliser)
+    members = jax.tree.leaves(actors)[0].shape[0]
+    seeds = members // len(VARIANTS)
 
     def of_style(label: jax.Array) -> UniversalEgo:
-        members = state.update.shape[0]
-        return UniversalEgo(raw, state.tells, jnp.broadcast_to(label, (members, *label.shape)))
+        labels = jnp.broadcast_to(label, (members, *label.shape))
+        return UniversalEgo(actors, tells_of(seeds), labels)
 
     egos = jax.vmap(of_style)(jnp.eye(len(env.style_names)))
-    seeds = state.update.shape[0] // len(VARIANTS)
     return {
         name: jax.tree.map(lambda leaf, i=index: leaf[:, i * seeds : (i + 1) * seeds], egos)
         for index, name in enumerate(VARIANTS)

@@ -184,11 +184,16 @@ def record(
 
     agent = ego if isinstance(ego, Agent) else Reactive(ego)
 
+    def act(memory: Any, *now: jax.Array) -> tuple[Distribution, Any]:
+        if isinstance(agent, Reactive):
+            return agent.act(memory, *now)
+        acting, memory = agent.act(memory, *(part[None] for part in now))
+        return jax.tree.map(lambda leaf: leaf[0], acting), memory
+
     def one_step(carry, step_key):
         state, observation, memory, shown, alive = carry
         act_key, env_key = jax.random.split(step_key)
-        acting, memory = agent.act(memory, observation.ego[None], shown[None])
-        acting = jax.tree.map(lambda leaf: leaf[0], acting)
+        acting, memory = act(memory, observation.ego, shown)
         distributions = Pair(acting, networks.act(partner, observation.partner))
         actions = draw_actions(act_key, distributions, greedy=greedy)
         following, timestep = env.step(env_key, state, actions, style)

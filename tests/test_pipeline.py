@@ -180,7 +180,8 @@ def test_baselines_are_measured_beside_the_method(monkeypatch, capsys, copied_ru
     assert "Adaptive Ego" in capsys.readouterr().out
     measured = json.loads((copied_run / "results.json").read_text())
     told = measured.pop("baselines")
-    assert (told["steps"], told["seeds"]) == (1280, 1)
+    assert (told["steps"], told["seeds"]) == (1280, 2)
+    assert "told the style" in measured.pop("descriptions")[recurrent_egos.INSTRUCTED]
     assert set(told["curve_returns"]) == set(recurrent_egos.VARIANTS)
     for name in recurrent_egos.VARIANTS:
         of_styles = measured["methods"].pop(name)
@@ -193,7 +194,7 @@ def test_baselines_are_measured_beside_the_method(monkeypatch, capsys, copied_ru
     assert (copied_run / "results.json").read_bytes() == made
     capsys.readouterr()
     line = refused(capsys, monkeypatch, baselines, copied_run, "--steps", 2000)
-    assert "has egos of 1,280 steps and 1 seeds already, not of 1,920 and 1" in line
+    assert "has egos of 1,280 steps and 2 seeds already, not of 1,920 and 2" in line
 
 
 def test_a_sentence_must_hold_words_and_not_too_many(capsys, monkeypatch, smoke_run):

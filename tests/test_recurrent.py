@@ -124,5 +124,3 @@ def test_nothing_is_remembered_of_another_game():
     on = jnp.zeros((4, 1), bool)
     np.testing.assert_array_equal(values(1.0, anew)[2:], values(-3.0, anew)[2:])
     assert float(jnp.abs(values(1.0, on)[2:] - values(-3.0, on)[2:]).min()) > 1e-4
-    forgotten = recurrent.forget(Memory(seen[0], seen[0]), jnp.array([True]))
-    assert not forgotten.cell.any()

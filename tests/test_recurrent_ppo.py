@@ -123,6 +123,7 @@ def test_learning_starts_from_what_was_played(monkeypatch):
     state, _ = update(state)
     state, _ = update(state)  # starts in the middle of games, from memories, and normalises
     jax.effects_barrier()
+    assert all(float(jnp.abs(part).min(axis=0).max()) > 0 for part in state.memories[0])
     assert len(seen) == 2 * config.num_minibatches
     for played_again, played, valued_again, valued in seen:
         np.testing.assert_allclose(played_again, played, atol=1e-5)
@@ -158,6 +159,8 @@ def test_partners_that_cannot_share_the_games_are_refused():
     config = dataclasses.replace(TINY, num_envs=9, num_minibatches=3)
     with pytest.raises(ValueError, match="is 9; expected a multiple of 2, the number of partners"):
         begin(ToyGame(), config)
+    with pytest.raises(ValueError, match=r"confined_until is 0\.5; expected 0"):
+        begin(ToyGame(), dataclasses.replace(TINY, confined_until=0.5))
 
 
 def test_egos_use_what_they_remember_and_what_they_are_told():
@@ -177,7 +180,7 @@ def test_egos_use_what_they_remember_and_what_they_are_told():
     state, _ = recurrent_ppo.compile_recurrent(game, config, config.num_updates)(
         begin(game, config)
     )
-    egos = recurrent_ppo.egos_by_style(game, state)
+    egos = recurrent_ppo.egos_by_style(game, recurrent_ppo.raw_actors(state))
     assert tuple(egos) == VARIANTS
     play = partners.compile_evaluation(game, 32)
     shares = {}
