@@ -25,6 +25,7 @@ class Adaptation:
         refit_length: factor on the steps of the best responses' refits.
         joint: settings of the joint training that differ.
         refit: settings of the best responses' refits that differ.
+        partners: settings of the partners and best responses that differ.
         training: settings of every training that differ; with `normalise` the policy VAE
             compresses normalised policies too.
     """
@@ -34,6 +35,7 @@ class Adaptation:
     refit_length: float = 1.0
     joint: Mapping[str, Any] = dataclasses.field(default_factory=dict)
     refit: Mapping[str, Any] = dataclasses.field(default_factory=dict)
+    partners: Mapping[str, Any] = dataclasses.field(default_factory=dict)
     training: Mapping[str, Any] = dataclasses.field(default_factory=dict)
 
 
@@ -57,8 +59,10 @@ ADAPTATIONS = {
     "assistive/jaco": Adaptation(
         max_steps=200,
         length=1.25,
-        refit_length=0.4,
+        refit_length=0.8,
         refit={"learning_rate": 3e-4},
+        # A universal ego learns little of scratching and bathing, and no style gains from it.
+        partners={"universal_start": False},
         training={
             "normalise": True,
             "entropy": 0.001,
@@ -174,6 +178,7 @@ def _adapted(config: RunConfig) -> RunConfig:
             joint=changed(partners.joint, change.length, **change.joint),
             refit=changed(partners.refit, change.refit_length, **change.refit),
             oracle=changed(partners.oracle),
+            **change.partners,
         ),
         compression=dataclasses.replace(
             compression, vae=dataclasses.replace(compression.vae, normalised=normalised)
