@@ -271,9 +271,9 @@ def quick(environment: str, seed: int) -> RunConfig:
 def overnight(environment: str, seed: int) -> RunConfig:
     """The scale of the recorded results: three training and three held-out seeds a style.
 
-    `python -m experiments.run --preset overnight --env all`; without `assistive/jaco` four hours
-    on two CPU cores, from half an hour (`lbf/spread`) to an hour and a half
-    (`overcooked/diverse_orders`).
+    `python -m experiments.run --preset overnight --env all`; six hours on two CPU cores, from
+    half an hour (`lbf/spread`) to more than an hour and a half (`overcooked/diverse_orders`,
+    `assistive/jaco`).
     """
     config = RunConfig(
         environment=environment,
