@@ -33,6 +33,8 @@ def interquartile_mean(scores: np.ndarray, axis: int | None = None) -> np.ndarra
 
     As in Agarwal et al. (2021) a quarter is rounded down to whole scores.
     """
+    if axis is None:
+        return stats.trim_mean(np.ravel(scores), 0.25)
     return stats.trim_mean(scores, 0.25, axis=axis)
 
 
