@@ -1,5 +1,6 @@
 """What all tests share: two host devices, a lasting compilation cache, one finished smoke run."""
 
+import contextlib
 import os
 
 # XLA reports on every program that it loads from the compilation cache; read once, at start.
@@ -38,6 +39,24 @@ def pytest_configure(config):
     jax.config.update("jax_persistent_cache_min_compile_time_secs", 0.0)
 
 
+@contextlib.contextmanager
+def compiled_lightly():
+    """Programs compile in half the time and run slower; for what runs for a moment only."""
+    jax.config.update("jax_disable_most_optimizations", True)
+    try:
+        yield
+    finally:
+        jax.config.update("jax_disable_most_optimizations", False)
+
+
+@pytest.fixture(autouse=True, scope="module")
+def compilation(request):
+    """Compiles the programs of modules that are marked so in half the time."""
+    light = request.node.get_closest_marker("light_compilation") is not None
+    with compiled_lightly() if light else contextlib.nullcontext():
+        yield
+
+
 @pytest.fixture(scope="session")
 def smoke_run(tmp_path_factory, worker_id):
     """The folder of an uninterrupted smoke run; made once, not to be written to."""
@@ -50,5 +69,6 @@ def smoke_run(tmp_path_factory, worker_id):
     path = folder / "smoke"
     with filelock.FileLock(folder / "smoke.lock"):
         if not (path / "report" / "metrics.json").exists():
-            run_pipeline(configs.smoke(configs.DEFAULT_ENVIRONMENT, seed=0), path)
+            with compiled_lightly():
+                run_pipeline(configs.smoke(configs.DEFAULT_ENVIRONMENT, seed=0), path)
     return path

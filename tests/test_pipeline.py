@@ -24,13 +24,14 @@ from experiments import (
     sight,
     training,
 )
+from experiments.errors import UserError
 from experiments.pipeline import run_pipeline
 from experiments.stages import STAGES
 from experiments.stages.best_responses import STARTS
 from haland_jax import recurrent_egos
 from haland_jax.universal import VARIANTS
 
-pytestmark = [pytest.mark.slow, pytest.mark.timeout(1500)]
+pytestmark = [pytest.mark.slow, pytest.mark.timeout(1500), pytest.mark.light_compilation]
 
 METHODS = {
     evaluation.ORACLE,
@@ -192,9 +193,8 @@ def test_baselines_are_measured_beside_the_method(monkeypatch, capsys, copied_ru
     made = (copied_run / "results.json").read_bytes()
     run_command(monkeypatch, baselines, copied_run, "--steps", 1300)
     assert (copied_run / "results.json").read_bytes() == made
-    capsys.readouterr()
-    line = refused(capsys, monkeypatch, baselines, copied_run, "--steps", 2000)
-    assert "has egos of 1,280 steps and 2 seeds already, not of 1,920 and 2" in line
+    with pytest.raises(UserError, match="egos of 1,280 steps and 2 seeds already, not of 1,920"):
+        baselines.measure(copied_run, 2000, 2)
 
 
 def test_a_sentence_must_hold_words_and_not_too_many(capsys, monkeypatch, smoke_run):

@@ -12,6 +12,8 @@ from haland_jax import fit, networks, policy_vae
 from haland_jax.hypernetwork import HypernetworkConfig, PolicyArchitecture
 from haland_jax.policy_vae import PolicyBatch, PolicyVAE, PolicyVAEConfig
 
+pytestmark = pytest.mark.light_compilation
+
 SMALL = PolicyVAEConfig(
     latent_dim=8,
     encoder_hidden=16,

@@ -14,6 +14,8 @@ from haland_jax import normalisation, partners, recurrent_egos, recurrent_ppo
 from haland_jax.ppo import PPOConfig
 from haland_jax.recurrent_egos import ADAPTIVE, GENERAL, INSTRUCTED, VARIANTS, Tells
 
+pytestmark = pytest.mark.light_compilation
+
 TINY = PPOConfig(
     total_steps=4 * 8 * 5,
     num_envs=8,
@@ -52,15 +54,8 @@ def frozen():
     return jax.tree.map(lambda *leaves: jnp.stack(leaves)[:, None], *pair)
 
 
-def begin(game, config=TINY, seeds=1):
-    return recurrent_ppo.init_recurrent(game, config, jax.random.key(0), frozen(), seeds)
-
-
-def differences(one, other):
-    return [
-        float(jnp.abs(a - b).max())
-        for a, b in zip(jax.tree.leaves(one), jax.tree.leaves(other), strict=True)
-    ]
+def begin(game, config=TINY):
+    return recurrent_ppo.init_recurrent(game, config, jax.random.key(0), frozen(), seeds=1)
 
 
 def test_an_ego_is_told_the_style_the_last_action_or_nothing():
@@ -132,29 +127,6 @@ def test_learning_starts_from_what_was_played(monkeypatch):
         assert np.std(valued) > 0.01
 
 
-def test_variants_of_a_seed_start_alike_and_interrupted_training_ends_alike():
-    game = ToyGame()
-    start = begin(game, seeds=2)
-    actor = start.ego.actor["params"]["head"]["kernel"]
-    np.testing.assert_array_equal(actor[0:2], actor[4:6])
-    assert float(jnp.abs(actor[0] - actor[1]).max()) > 0
-    start_actor = np.asarray(start.ego.actor["params"]["body"]["told"]["kernel"])
-    whole, metrics = recurrent_ppo.compile_recurrent(game, TINY, 4)(begin(game, seeds=2))
-    half = recurrent_ppo.compile_recurrent(game, TINY, 2)
-    pieces = half(half(begin(game, seeds=2))[0])[0]
-    assert max(differences(whole.ego, pieces.ego)) < 1e-5
-    assert metrics["return"].shape == (6, 4)
-    moved = np.abs(np.asarray(whole.ego.actor["params"]["body"]["told"]["kernel"]) - start_actor)
-    assert (moved[:2] == 0).all()
-    assert (moved[2:4, :2].max(axis=(1, 2)) > 0).all()
-    assert (moved[2:4, 2:] == 0).all()
-    assert (moved[4:, :2] == 0).all()
-    assert (moved[4:, 2:].max(axis=(1, 2)) > 0).all()
-    for name in ("dense_0", "dense_2"):
-        trained = partners.flatten(frozen())["params"][name]["bias"]
-        np.testing.assert_array_equal(whole.partners["params"][name]["bias"][0], trained)
-
-
 def test_partners_that_cannot_share_the_games_are_refused():
     config = dataclasses.replace(TINY, num_envs=9, num_minibatches=3)
     with pytest.raises(ValueError, match="is 9; expected a multiple of 2, the number of partners"):
@@ -177,8 +149,19 @@ def test_egos_use_what_they_remember_and_what_they_are_told():
         confined_until=0.0,
         normalise=True,
     )
-    state, _ = recurrent_ppo.compile_recurrent(game, config, config.num_updates)(
-        begin(game, config)
+    start = begin(game, config)
+    before = jax.tree.map(np.asarray, (start.ego.actor, start.partners))
+    half = recurrent_ppo.compile_recurrent(game, config, config.num_updates // 2)
+    state, metrics = half(half(start)[0])
+    assert metrics["return"].shape == (3, config.num_updates // 2)
+    # All start alike; what an ego is not told, it learns nothing of. Partners stay as they are.
+    actor, stayed = jax.tree.map(np.asarray, (state.ego.actor, state.partners))
+    jax.tree.map(np.testing.assert_array_equal, stayed, before[1])
+    first = before[0]["params"]["body"]["told"]["kernel"]
+    assert (first == first[0]).all()
+    moved = np.abs(actor["params"]["body"]["told"]["kernel"] - first).max(axis=2) > 0
+    np.testing.assert_array_equal(
+        moved, [[False] * 4, [True, True, False, False], [False, False, True, True]]
     )
     egos = recurrent_ppo.egos_by_style(game, recurrent_ppo.raw_actors(state))
     assert tuple(egos) == VARIANTS
