@@ -58,11 +58,12 @@ ADAPTATIONS = {
     # 0.4 M steps; scratching and bathing take longest. High rates ruin egos that are good already.
     "assistive/jaco": Adaptation(
         max_steps=200,
-        length=1.25,
+        length=1.5,
         refit_length=0.8,
         refit={"learning_rate": 3e-4},
         # A universal ego learns little of scratching and bathing, and no style gains from it.
-        partners={"universal_start": False},
+        # Persons who knew one robot only presented nothing to another that did as well.
+        partners={"universal_start": False, "updates_together": 5},
         training={
             "normalise": True,
             "entropy": 0.001,

@@ -50,6 +50,9 @@ def train_population(
     saver: Saver,
     report: Callable[[int, dict[str, float]], None],
     stage: str,
+    *,
+    updates_per_piece: int = UPDATES_PER_PIECE,
+    between: Callable[[TrainState], TrainState] | None = None,
 ) -> tuple[Pair, np.ndarray]:
     """Trains a population to its end.
 
@@ -61,6 +64,8 @@ def train_population(
         saver: where interrupted training goes on from.
         report: called with the updates done and the mean return.
         stage: for messages.
+        updates_per_piece: updates of each compiled piece.
+        between: what happens to the state between two pieces, if anything.
 
     Returns:
         The trained players (`partners.trained_players`), and the training games' mean return,
@@ -75,7 +80,16 @@ def train_population(
         train = partners.compile_training(env, config, updates)
         return lambda state: train(state, styles)
 
-    state, returns = train_in_pieces(config, start(), compiled, saver, report, stage)
+    state, returns = train_in_pieces(
+        config,
+        start(),
+        compiled,
+        saver,
+        report,
+        stage,
+        updates_per_piece=updates_per_piece,
+        between=between,
+    )
     return partners.trained_players(state), returns
 
 
@@ -86,6 +100,9 @@ def train_in_pieces(
     saver: Saver,
     report: Callable[[int, dict[str, float]], None],
     stage: str,
+    *,
+    updates_per_piece: int = UPDATES_PER_PIECE,
+    between: Callable[[Any], Any] | None = None,
 ) -> tuple[Any, np.ndarray]:
     """Trains a population of any kind to its end.
 
@@ -96,6 +113,8 @@ def train_in_pieces(
         saver: where interrupted training goes on from.
         report: called with the updates done and the mean return.
         stage: for messages.
+        updates_per_piece: updates of each compiled piece.
+        between: what happens to the state between two pieces, if anything.
 
     Returns:
         The final state, and the training games' mean return, [update, member].
@@ -112,7 +131,7 @@ def train_in_pieces(
     programs: dict[int, Callable[[Any], tuple[Any, dict[str, jax.Array]]]] = {}
     done = int(np.asarray(state.update)[0])
     while done < config.num_updates:
-        size = min(UPDATES_PER_PIECE, config.num_updates - done)
+        size = min(updates_per_piece, config.num_updates - done)
         if size not in programs:
             programs[size] = compiled(size)
         state, metrics = programs[size](state)
@@ -121,6 +140,8 @@ def train_in_pieces(
         returns[done : done + size] = metrics["return"]
         done += size
         report(done, {"return": float(metrics["return"].mean())})
+        if between is not None and done < config.num_updates:
+            state = share_out(between(state))
         saver.save_if_due({"state": state, "returns": returns})
     return state, returns
 

@@ -26,11 +26,11 @@ from haland_jax.partners import (
     Population,
     flatten,
     repeat_styles,
-    take_seeds,
     teachers,
 )
 from haland_jax.population import over_population
 from haland_jax.ppo import PPOConfig
+from haland_jax.seeds import take_seeds
 
 AS_GOOD = 0.97
 """Share of the best ego's return from which another one counts as good."""

@@ -1,8 +1,8 @@
 """Styled partners, and the egos that learn beside them.
 
 Partner and ego learn together, many seeds of every style in one program (`init_pairs`). The best
-seeds of each style are kept, by one rule for training and held-out seeds alike (`select_seeds`):
-partners that never learnt their style are no partners.
+seeds of each style are kept, by one rule for training and held-out seeds alike
+(`haland_jax.seeds`): partners that never learnt their style are no partners.
 
 Everything is flattened to members [style * seed] for `over_population`.
 """
@@ -24,6 +24,7 @@ from haland_jax.networks import Policy, layer_names
 from haland_jax.normalisation import Normaliser
 from haland_jax.population import over_population
 from haland_jax.ppo import PPOConfig
+from haland_jax.seeds import meet_next_partners, select_from_circles, select_seeds, take_seeds
 
 
 def best_response_config(total_steps: int, num_envs: int = 32) -> PPOConfig:
@@ -72,6 +73,10 @@ class PartnersConfig:
         held_out_seeds: partners of each style that it is judged with.
         spare_seeds: further seeds of each style, so that the worst pairs can be rejected; best
             responses learn with their partners too.
+        updates_together: updates after which every ego moves on to the next partner of its circle,
+            so that partners learn to do with more than one ego; 0: pairs stay together. A style
+            has two circles, which never meet: one of those that may become training partners, one
+            of those that may be held out. They share the spare seeds.
         joint: training of partner and ego together.
         refit: training of an ego against all frozen partners of its style that are not held
             out.
@@ -86,9 +91,10 @@ class PartnersConfig:
     train_seeds: int = 5
     held_out_seeds: int = 5
     spare_seeds: int = 2
+    updates_together: int = 0
     joint: PPOConfig = dataclasses.field(default_factory=PPOConfig)
     refit: PPOConfig = dataclasses.field(
-        default_factory=lambda: best_response_config(2_000_000, num_envs=56)
+        default_factory=lambda: best_response_config(2_000_000, num_envs=84)
     )
     oracle: PPOConfig = dataclasses.field(default_factory=lambda: oracle_config(300_000))
     oracle_candidates: int = 3
@@ -100,6 +106,9 @@ class PartnersConfig:
         for name in ("train_seeds", "held_out_seeds", "oracle_candidates", "evaluation_games"):
             if getattr(self, name) < 1:
                 raise ValueError(f"{name} is {getattr(self, name)}; expected at least 1")
+        for name in ("spare_seeds", "updates_together"):
+            if getattr(self, name) < 0:
+                raise ValueError(f"{name} is {getattr(self, name)}; expected 0 or more")
         ppo.expect_equal_shares(
             "refit", self.refit, self.known_seeds, "partners of train_seeds + spare_seeds"
         )
@@ -107,12 +116,16 @@ class PartnersConfig:
     @property
     def num_seeds(self) -> int:
         """Seeds of each style that are trained."""
-        return self.known_seeds + self.held_out_seeds
+        return self.train_seeds + self.held_out_seeds + self.spare_seeds
 
     @property
     def known_seeds(self) -> int:
-        """Seeds of each style that the method may learn with: all that are not held out."""
-        return self.train_seeds + self.spare_seeds
+        """Seeds of each style that the method may learn with.
+
+        All that are not held out, or, with `updates_together`, those of the training circle.
+        """
+        spare = (self.spare_seeds + 1) // 2 if self.updates_together else self.spare_seeds
+        return self.train_seeds + spare
 
 
 class Player(PyTreeNode):
@@ -168,6 +181,7 @@ class Population(PyTreeNode):
         joint_returns: mean return of each pair, float32 [style, num_seeds].
         train_index: which seeds became training partners, int32 [style, train_seeds].
         held_out_index: which became held-out partners, int32 [style, held_out_seeds].
+        known_index: which the method may learn with, int32 [style, known_seeds].
     """
 
     partners: Policy
@@ -175,6 +189,7 @@ class Population(PyTreeNode):
     joint_returns: jax.Array
     train_index: jax.Array
     held_out_index: jax.Array
+    known_index: jax.Array
 
     @property
     def train_partners(self) -> Policy:
@@ -188,13 +203,12 @@ class Population(PyTreeNode):
 
     @property
     def known_partners(self) -> Policy:
-        """Actors of all that are not held out, the rejected ones included, [style, known_seeds].
+        """Actors of all that the method may learn with, [style, known_seeds].
 
-        The more ways of sharing the work an ego has met, the better it serves those it has not.
+        The rejected ones are among them: the more ways of sharing the work an ego has met, the
+        better it serves those it has not.
         """
-        seeds = np.arange(self.joint_returns.shape[1])
-        known = [np.setdiff1d(seeds, held_out) for held_out in np.asarray(self.held_out_index)]
-        return take_seeds(self.partners, np.stack(known))
+        return take_seeds(self.partners, self.known_index)
 
     @property
     def train_egos(self) -> Player:
@@ -268,45 +282,22 @@ def compile_training(
     return over_population(chunk, donate=(0,), compiler_options=env.compiler_options)
 
 
+def compile_moving_on(
+    env: Environment, config: PartnersConfig
+) -> Callable[[TrainState], TrainState]:
+    """Compiles `seeds.meet_next_partners` for `config`'s circles; the given state is consumed."""
+    circles = config.known_seeds, config.num_seeds - config.known_seeds
+    return jax.jit(
+        lambda pairs: meet_next_partners(pairs, len(env.style_names), circles), donate_argnums=0
+    )
+
+
 def compile_evaluation(
     env: Environment, num_games: int
 ) -> Callable[[jax.Array, Policy, Policy, Any], rollout.Games]:
     """Compiles the evaluation of pairs: keys, egos, partners, styles [member] -> `Games`."""
     play = partial(rollout.play, env, num_games=num_games)
     return over_population(play, compiler_options=env.compiler_options)
-
-
-def select_seeds(
-    returns: np.ndarray, num_train: int, num_held_out: int
-) -> tuple[np.ndarray, np.ndarray]:
-    """Keeps the best seeds of each style and deals them out.
-
-    The seeds with the highest returns are kept; by rank they go in turn to the training and
-    to the held-out partners, so that neither group is the better one by choice.
-
-    Args:
-        returns: mean return of each pair, [style, seed].
-        num_train: training partners of each style.
-        num_held_out: held-out partners of each style.
-
-    Returns:
-        Indices of seeds, int32 [style, num_train] and [style, num_held_out].
-    """
-    kept = np.argsort(-returns, axis=1, kind="stable")[:, : num_train + num_held_out]
-    train, held_out = [], []
-    for rank in range(kept.shape[1]):
-        wants_train = len(train) * num_held_out <= len(held_out) * num_train
-        (train if wants_train and len(train) < num_train else held_out).append(rank)
-    while len(held_out) > num_held_out:
-        train.append(held_out.pop())
-    return kept[:, sorted(train)].astype(np.int32), kept[:, held_out].astype(np.int32)
-
-
-@jax.jit
-def take_seeds(tree: Any, index: np.ndarray | jax.Array) -> Any:
-    """Picks seeds by style: leaves [style, seed, ...], index [style, n] -> [style, n, ...]."""
-    rows = np.arange(index.shape[0])[:, None]
-    return jax.tree.map(lambda leaf: leaf[rows, index], tree)
 
 
 def teachers(env: Environment, config: PartnersConfig, population: Population) -> Policy:
@@ -349,7 +340,7 @@ def _seen_in(mirror: Symmetry, policies: Policy) -> Policy:
 def make_population(
     env: Environment, config: PartnersConfig, players: Pair, returns: np.ndarray
 ) -> Population:
-    """Says which pairs train and which are held out, by `select_seeds`.
+    """Says which pairs train and which are held out, by the rules of `haland_jax.seeds`.
 
     Args:
         env: the environment.
@@ -358,13 +349,20 @@ def make_population(
         returns: mean return of each pair, [style, num_seeds].
     """
     num_styles = len(env.style_names)
-    train, held_out = select_seeds(returns, config.train_seeds, config.held_out_seeds)
+    counts = config.train_seeds, config.held_out_seeds
+    if config.updates_together:
+        train, held_out = select_from_circles(returns, config.known_seeds, *counts)
+        known = np.tile(np.arange(config.known_seeds), (num_styles, 1))
+    else:
+        train, held_out = select_seeds(returns, *counts)
+        known = np.stack([np.setdiff1d(np.arange(config.num_seeds), one) for one in held_out])
     return Population(
         partners=unflatten(players.partner.actor, num_styles),
         egos=unflatten(players.ego, num_styles),
         joint_returns=jnp.asarray(returns),
         train_index=jnp.asarray(train),
         held_out_index=jnp.asarray(held_out),
+        known_index=jnp.asarray(known, jnp.int32),
     )
 
 

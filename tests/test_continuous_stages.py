@@ -45,7 +45,8 @@ def run(tmp_path_factory):
         partners=PartnersConfig(
             train_seeds=1,
             held_out_seeds=1,
-            spare_seeds=1,
+            spare_seeds=2,
+            updates_together=20,
             joint=TRAINING,
             refit=SHORT,
             oracle=SHORT,

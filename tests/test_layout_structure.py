@@ -18,6 +18,7 @@ ORDER = (
     "ppo_loss",
     "learner",
     "ppo",
+    "seeds",
     "partners",
     "universal",
     "recurrent",

@@ -9,8 +9,9 @@ import pytest
 from toy_game import ToyGame, always
 
 from haland_jax import best_responses, partners
-from haland_jax.partners import PartnersConfig, Player, select_seeds
+from haland_jax.partners import PartnersConfig, Player
 from haland_jax.ppo import PPOConfig
+from haland_jax.seeds import meet_next_partners, select_from_circles, select_seeds, take_seeds
 
 TINY = PPOConfig(
     total_steps=80, num_envs=4, rollout_steps=5, num_minibatches=2, epochs=1, confined_until=0.0
@@ -85,6 +86,52 @@ def test_equal_returns_are_taken_in_the_order_of_the_seeds():
     assert (train.tolist(), held_out.tolist()) == ([[0]], [[1]])
 
 
+def test_each_circle_keeps_its_own_best_seeds():
+    train, held_out = select_from_circles(RETURNS, 3, 2, 1)
+    # Seeds 0 to 2 of the first style: 10, 40, 5; seeds 3 and 4: 30, 20.
+    np.testing.assert_array_equal(train, [[1, 0], [2, 1]])
+    np.testing.assert_array_equal(held_out, [[3], [4]])
+
+
+def test_egos_meet_all_partners_of_their_circle_in_turn_and_no_others(game, pairs):
+    def met(state):
+        return np.asarray(state.ego.actor["params"]["dense_2"]["bias"][:, 0]).astype(int)
+
+    numbers = jnp.arange(10)[:, None] + jnp.zeros_like(pairs.ego.actor["params"]["dense_2"]["bias"])
+    layers = {**pairs.ego.actor["params"]}
+    layers["dense_2"] = {**layers["dense_2"], "bias": numbers}
+    state = pairs.replace(ego=pairs.ego.replace(actor={"params": layers}))
+    order = []
+    for _ in range(6):
+        order.append(met(state))
+        moved = meet_next_partners(state, 2, (3, 2))
+        jax.tree.map(np.testing.assert_array_equal, moved.partner, state.partner)
+        state = moved
+    np.testing.assert_array_equal(order[1], [2, 0, 1, 4, 3, 7, 5, 6, 9, 8])
+    np.testing.assert_array_equal(met(state), order[0])
+    assert [{egos[member] for egos in order} for member in range(10)] == [
+        *[{0, 1, 2}] * 3,
+        *[{3, 4}] * 2,
+        *[{5, 6, 7}] * 3,
+        *[{8, 9}] * 2,
+    ]
+
+
+def test_partners_of_two_circles_share_the_spare_seeds(game, pairs):
+    config = dataclasses.replace(CONFIG, held_out_seeds=1, spare_seeds=2, updates_together=5)
+    assert (config.known_seeds, config.num_seeds) == (3, 5)
+    kept = partners.make_population(game, config, partners.trained_players(pairs), RETURNS)
+    np.testing.assert_array_equal(kept.train_index, [[1, 0], [2, 1]])
+    np.testing.assert_array_equal(kept.held_out_index, [[3], [4]])
+    np.testing.assert_array_equal(kept.known_index, [[0, 1, 2], [0, 1, 2]])
+
+
+@pytest.mark.parametrize("name", ["spare_seeds", "updates_together"])
+def test_a_negative_count_is_refused(name):
+    with pytest.raises(ValueError, match=rf"{name} is -1; expected 0 or more"):
+        dataclasses.replace(CONFIG, **{name: -1})
+
+
 def test_flatten_and_unflatten_are_inverse_and_take_seeds_picks_by_style():
     tree = {"a": jnp.arange(24).reshape(2, 4, 3), "b": jnp.arange(8).reshape(2, 4)}
     flat = partners.flatten(tree)
@@ -92,7 +139,7 @@ def test_flatten_and_unflatten_are_inverse_and_take_seeds_picks_by_style():
     assert flat["a"].shape == (8, 3)
     back = partners.unflatten(flat, 2)
     jax.tree.map(np.testing.assert_array_equal, back, tree)
-    picked = partners.take_seeds(tree, np.array([[3, 0], [1, 1]]))
+    picked = take_seeds(tree, np.array([[3, 0], [1, 1]]))
     np.testing.assert_array_equal(picked["b"], [[3, 0], [5, 5]])
     np.testing.assert_array_equal(picked["a"][0, 0], tree["a"][0, 3])
 

@@ -10,7 +10,7 @@ import numpy as np
 
 from experiments.progress import StageProgress
 from experiments.stages.context import Run
-from experiments.training import Saver, train_population
+from experiments.training import UPDATES_PER_PIECE, Saver, train_population
 from haland_jax import checkpoint, partners
 from haland_jax.networks import Policy
 from haland_jax.partners import Player, Population
@@ -30,6 +30,8 @@ def make_partners(run: Run, task: StageProgress) -> dict[str, Any]:
         Saver(run.path("partners", "unfinished")),
         task.update,
         "partners",
+        updates_per_piece=config.updates_together or UPDATES_PER_PIECE,
+        between=partners.compile_moving_on(env, config) if config.updates_together else None,
     )
     returns = mean_returns(
         run, play_key, players.ego.actor, players.partner.actor, config.num_seeds
@@ -71,6 +73,7 @@ def load_population(run: Run) -> Population:
         joint_returns=shape((styles, config.num_seeds), jnp.float32),
         train_index=shape((styles, config.train_seeds), jnp.int32),
         held_out_index=shape((styles, config.held_out_seeds), jnp.int32),
+        known_index=shape((styles, config.known_seeds), jnp.int32),
     )
     return checkpoint.restore(run.path("partners", "population"), like)
 
