@@ -51,7 +51,7 @@ def train_population(
     report: Callable[[int, dict[str, float]], None],
     stage: str,
     *,
-    updates_per_piece: int = UPDATES_PER_PIECE,
+    updates_per_piece: int | None = None,
     between: Callable[[TrainState], TrainState] | None = None,
 ) -> tuple[Pair, np.ndarray]:
     """Trains a population to its end.
@@ -64,7 +64,7 @@ def train_population(
         saver: where interrupted training goes on from.
         report: called with the updates done and the mean return.
         stage: for messages.
-        updates_per_piece: updates of each compiled piece.
+        updates_per_piece: updates of each compiled piece; `UPDATES_PER_PIECE` by default.
         between: what happens to the state between two pieces, if anything.
 
     Returns:
@@ -101,7 +101,7 @@ def train_in_pieces(
     report: Callable[[int, dict[str, float]], None],
     stage: str,
     *,
-    updates_per_piece: int = UPDATES_PER_PIECE,
+    updates_per_piece: int | None = None,
     between: Callable[[Any], Any] | None = None,
 ) -> tuple[Any, np.ndarray]:
     """Trains a population of any kind to its end.
@@ -113,7 +113,7 @@ def train_in_pieces(
         saver: where interrupted training goes on from.
         report: called with the updates done and the mean return.
         stage: for messages.
-        updates_per_piece: updates of each compiled piece.
+        updates_per_piece: updates of each compiled piece; `UPDATES_PER_PIECE` by default.
         between: what happens to the state between two pieces, if anything.
 
     Returns:
@@ -131,7 +131,7 @@ def train_in_pieces(
     programs: dict[int, Callable[[Any], tuple[Any, dict[str, jax.Array]]]] = {}
     done = int(np.asarray(state.update)[0])
     while done < config.num_updates:
-        size = min(updates_per_piece, config.num_updates - done)
+        size = min(updates_per_piece or UPDATES_PER_PIECE, config.num_updates - done)
         if size not in programs:
             programs[size] = compiled(size)
         state, metrics = programs[size](state)

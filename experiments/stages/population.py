@@ -10,7 +10,7 @@ import numpy as np
 
 from experiments.progress import StageProgress
 from experiments.stages.context import Run
-from experiments.training import UPDATES_PER_PIECE, Saver, train_population
+from experiments.training import Saver, train_population
 from haland_jax import checkpoint, partners
 from haland_jax.networks import Policy
 from haland_jax.partners import Player, Population
@@ -30,7 +30,7 @@ def make_partners(run: Run, task: StageProgress) -> dict[str, Any]:
         Saver(run.path("partners", "unfinished")),
         task.update,
         "partners",
-        updates_per_piece=config.updates_together or UPDATES_PER_PIECE,
+        updates_per_piece=config.updates_together or None,
         between=partners.compile_moving_on(env, config) if config.updates_together else None,
     )
     returns = mean_returns(
