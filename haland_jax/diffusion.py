@@ -18,13 +18,12 @@ from flax.struct import PyTreeNode
 from jax import Array
 
 from haland_jax.fit import FitConfig, LossFn, SampleFn
+from haland_jax.noise_schedule import PAPER_STEPS, NoiseSchedule, noise_schedule
 from haland_jax.task_language import BINS, jittered
-from haland_jax.unet import Conditioner, UNet, UNetConfig
+from haland_jax.unet import Conditioner, UNet, UNetConfig, VectorConditioner
 
 NoiseFn = Callable[[Array, Array], Array]
 """(noisy latent [D], noise step []) -> predicted noise [D]."""
-
-PAPER_STEPS, PAPER_BETA = 1000, (1e-4, 0.02)
 
 
 @dataclass(frozen=True)
@@ -40,6 +39,8 @@ class DiffusionConfig:
         unet: widths of Table 3's UNet.
         bins: V of Eq. 8 (App. D).
         token_features: width d of a token's embedding.
+        vector_tokens: 0 for a task language as condition; otherwise it is any vector, such as a
+            sentence's embedding, which becomes so many tokens (an ablation of Table 1).
         noise_steps: N. Other values than 1000 rescale β so that the last step is as noisy.
         ddim_steps: steps of the fast sampler, at most N.
         eta: noise of the fast sampler, 0 none, 1 as much as Eq. 1.
@@ -58,6 +59,7 @@ class DiffusionConfig:
     unet: UNetConfig = field(default_factory=UNetConfig)
     bins: int = BINS
     token_features: int = 32
+    vector_tokens: int = 0
     noise_steps: int = PAPER_STEPS
     ddim_steps: int = 25
     eta: float = 0.0
@@ -76,6 +78,7 @@ class DiffusionConfig:
     def __post_init__(self):
         expected = {
             "bins": (self.bins >= 2, ">= 2"),
+            "vector_tokens": (self.vector_tokens >= 0, ">= 0"),
             "noise_steps": (self.noise_steps >= 10, ">= 10"),
             "ddim_steps": (2 <= self.ddim_steps <= self.noise_steps, "in [2, noise_steps]"),
             "eta": (0 <= self.eta <= 1, "in [0, 1]"),
@@ -106,7 +109,8 @@ class LatentArchive(PyTreeNode):
 
     Attributes:
         z_mean, z_log_variance: [P, D], the autoencoder's posterior.
-        v_hat: [P, U], the task language of each policy's style, in [0, 1].
+        v_hat: [P, U], the task language of each policy's style, in [0, 1]; with
+            `DiffusionConfig.vector_tokens` any vector.
     """
 
     z_mean: Array
@@ -153,38 +157,6 @@ def latent_statistics(archive: LatentArchive) -> LatentStatistics:
     )
 
 
-class NoiseSchedule(PyTreeNode):
-    """Linear β with α = 1 - β and ᾱ its running product; each [N]."""
-
-    beta: Array
-    alpha: Array
-    alpha_bar: Array
-
-
-def noise_schedule(noise_steps: int) -> NoiseSchedule:
-    """The linear schedule 1e-4 .. 0.02 of N = 1000 (Ho et al., 2020), rescaled for another N.
-
-    β is multiplied by the one factor that leaves ᾱ_N at its value for N = 1000, about 4e-5:
-    otherwise the last step would not be pure noise and sampling from N(0, I) would be wrong.
-    """
-    target = np.log1p(-np.linspace(*PAPER_BETA, PAPER_STEPS)).sum()
-    base = np.linspace(*PAPER_BETA, noise_steps)
-    low, high = 0.0, 1.0 / base[-1]
-    for _ in range(200):
-        factor = 0.5 * (low + high)
-        if np.log1p(-factor * base).sum() > target:
-            low = factor
-        else:
-            high = factor
-    beta = base if noise_steps == PAPER_STEPS else low * base
-    alpha_bar = np.exp(np.log1p(-beta).cumsum())
-    return NoiseSchedule(
-        beta=jnp.asarray(beta, jnp.float32),
-        alpha=jnp.asarray(1 - beta, jnp.float32),
-        alpha_bar=jnp.asarray(alpha_bar, jnp.float32),
-    )
-
-
 class NoisePredictor(nn.Module):
     """ε_θ(z_i, i, τ_θ(L_T)) of Eq. 5, on flat latents.
 
@@ -196,7 +168,12 @@ class NoisePredictor(nn.Module):
     config: DiffusionConfig
 
     def setup(self):
-        self.conditioner = Conditioner(self.config.bins, self.config.token_features)
+        tokens, features = self.config.vector_tokens, self.config.token_features
+        self.conditioner = (
+            VectorConditioner(tokens, features)
+            if tokens
+            else Conditioner(self.config.bins, features)
+        )
         self.unet = UNet(self.config.unet)
 
     def __call__(self, noisy: Array, step: Array, v_hat: Array, dropped: Array) -> Array:
@@ -250,8 +227,10 @@ def make_sample_fn(config: DiffusionConfig, statistics: LatentStatistics) -> Sam
         rows = jax.random.randint(row_key, (config.batch_size,), 0, archive.z_mean.shape[0])
         noise = jax.random.normal(posterior_key, (config.batch_size, config.latent_size))
         z = archive.z_mean[rows] + jnp.exp(0.5 * archive.z_log_variance[rows]) * noise
-        v_hat = jittered(jitter_key, archive.v_hat[rows], config.frequency_jitter)
-        return statistics.standardise(z), v_hat
+        condition = archive.v_hat[rows]
+        if not config.vector_tokens:
+            condition = jittered(jitter_key, condition, config.frequency_jitter)
+        return statistics.standardise(z), condition
 
     return sample_fn
 

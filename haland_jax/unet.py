@@ -213,6 +213,19 @@ class Conditioner(nn.Module):
         return jnp.where(dropped, nothing, tokens)
 
 
+class VectorConditioner(nn.Module):
+    """Any vector [W] -> tokens [count, d], linearly, or the unconditional embedding [d]."""
+
+    count: int
+    features: int
+
+    @nn.compact
+    def __call__(self, vector: Array, dropped: Array) -> Array:
+        tokens = nn.Dense(self.count * self.features, name="tokens")(vector)
+        nothing = self.param("unconditional", nn.initializers.normal(1.0), (self.features,))
+        return jnp.where(dropped, nothing, tokens.reshape(self.count, self.features))
+
+
 class Upsample(nn.Module):
     """[H, W, C] -> [2 H, 2 W, features]: every cell makes four different ones (sub-pixel layer).
 

@@ -294,3 +294,21 @@ def test_an_unknown_sampler_is_refused(tiny_network):
     fitted = DiffusionParams(tiny_network, latent_statistics(two_clusters()))
     with pytest.raises(ValueError, match="sampler"):
         sample(jax.random.key(0), fitted, jnp.zeros(3), TINY, "euler")
+
+
+def test_any_vector_can_be_the_condition():
+    config = dataclasses.replace(TINY, vector_tokens=3)
+    archive = two_clusters().replace(
+        v_hat=jnp.array([[-4.0, 2.0], [-4.0, 2.0], [7.0, 0.0]] * 2)[:4]
+    )
+    _, drawn = make_sample_fn(config, latent_statistics(archive))(jax.random.key(0), archive)
+    assert {tuple(row) for row in np.asarray(drawn).tolist()} <= {(-4.0, 2.0), (7.0, 0.0)}
+    params = init_network(jax.random.key(0), config, 2)
+    network = NoisePredictor(config)
+    tokens = network.apply(params, archive.v_hat[0], jnp.array(False), method="tokens")
+    assert tokens.shape == (3, config.token_features)
+    nothing = network.apply(params, archive.v_hat[0], jnp.array(True), method="tokens")
+    np.testing.assert_array_equal(nothing[0], nothing[2])
+    z = sample(jax.random.key(1), DiffusionParams(params, latent_statistics(archive)),
+               archive.v_hat[0], config)  # fmt: skip
+    assert z.shape == (64,)

@@ -9,8 +9,9 @@ from made_up_results import SHARES, STYLES, UNIVERSAL_SHARES, made_up_results
 from matplotlib._pylab_helpers import Gcf
 from PIL import Image
 
-from experiments import figures, summary
+from experiments import summary
 from experiments.errors import UserError
+from experiments.figures import of_run as figures
 
 
 def two_styles() -> dict:

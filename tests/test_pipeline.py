@@ -14,7 +14,6 @@ from PIL import Image
 from refused_command import refused
 
 from experiments import (
-    baselines,
     configs,
     devices,
     evaluate,
@@ -24,11 +23,9 @@ from experiments import (
     sight,
     training,
 )
-from experiments.errors import UserError
 from experiments.pipeline import run_pipeline
 from experiments.stages import STAGES
 from experiments.stages.best_responses import STARTS
-from haland_jax import recurrent_egos
 from haland_jax.universal import VARIANTS
 
 pytestmark = [pytest.mark.slow, pytest.mark.timeout(1500), pytest.mark.light_compilation]
@@ -174,27 +171,6 @@ def test_sight_adds_egos_that_see_the_partner_nearby(monkeypatch, capsys, copied
 def test_sight_refuses_what_is_no_distance(capsys, monkeypatch, smoke_run):
     line = refused(capsys, monkeypatch, sight, smoke_run, "--cells", 2, -1)
     assert "cells is -1; expected numbers from 0 up" in line
-
-
-def test_baselines_are_measured_beside_the_method(monkeypatch, capsys, copied_run, results):
-    run_command(monkeypatch, baselines, copied_run, "--steps", 1300)
-    assert "Adaptive Ego" in capsys.readouterr().out
-    measured = json.loads((copied_run / "results.json").read_text())
-    told = measured.pop("baselines")
-    assert (told["steps"], told["seeds"]) == (1280, 2)
-    assert "told the style" in measured.pop("descriptions")[recurrent_egos.INSTRUCTED]
-    assert set(told["curve_returns"]) == set(recurrent_egos.VARIANTS)
-    for name in recurrent_egos.VARIANTS:
-        of_styles = measured["methods"].pop(name)
-        assert list(of_styles) == results["styles"]
-        assert all(np.shape(style["returns"]) == (1,) for style in of_styles.values())
-    assert measured == results
-    assert "Adaptive Ego" in (copied_run / "report.md").read_text()
-    made = (copied_run / "results.json").read_bytes()
-    run_command(monkeypatch, baselines, copied_run, "--steps", 1300)
-    assert (copied_run / "results.json").read_bytes() == made
-    with pytest.raises(UserError, match="egos of 1,280 steps and 2 seeds already, not of 1,920"):
-        baselines.measure(copied_run, 2000, 2)
 
 
 def test_a_sentence_must_hold_words_and_not_too_many(capsys, monkeypatch, smoke_run):

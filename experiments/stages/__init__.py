@@ -10,8 +10,12 @@ from experiments.stages.best_responses import make_best_responses, make_task_lan
 from experiments.stages.context import STAGE_NAMES as STAGE_NAMES
 from experiments.stages.context import Run as Run
 from experiments.stages.model import fit_diffusion, fit_policy_vae, fit_translator
+from experiments.stages.model import fit_latent_diffusion as fit_latent_diffusion
+from experiments.stages.model import fit_translation as fit_translation
 from experiments.stages.model import load_haland as load_haland
+from experiments.stages.model import load_pretrained as load_pretrained
 from experiments.stages.model import load_vae as load_vae
+from experiments.stages.model import prepare_instructions as prepare_instructions
 from experiments.stages.population import load_population as load_population
 from experiments.stages.population import make_partners
 from experiments.stages.universal import load_universal as load_universal

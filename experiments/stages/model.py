@@ -22,8 +22,9 @@ from haland_jax import (
     policy_vae,
     translator,
 )
+from haland_jax.bert import BertArchitecture
 from haland_jax.deployment import Haland
-from haland_jax.diffusion import DiffusionParams, LatentArchive
+from haland_jax.diffusion import DiffusionConfig, DiffusionParams, LatentArchive
 from haland_jax.hypernetwork import PolicyArchitecture
 from haland_jax.networks import Policy
 from haland_jax.partners import Population
@@ -150,26 +151,41 @@ def fit_diffusion(run: Run, task: StageProgress) -> dict[str, Any]:
     times = run.config.partners.train_seeds
     v_hat = jnp.repeat(language.v_hat, times, axis=0)
     archive = LatentArchive(posterior.mean, posterior.log_variance, v_hat)
+    params, metrics = fit_latent_diffusion(
+        run.key("diffusion"), config, archive, Saver(run.path("diffusion", "unfinished")), task
+    )
+    checkpoint.save(run.path("diffusion", "model"), params)
+    return metrics
+
+
+def fit_latent_diffusion(
+    key: jax.Array,
+    config: DiffusionConfig,
+    archive: LatentArchive,
+    saver: Saver,
+    task: StageProgress,
+) -> tuple[DiffusionParams, dict[str, float]]:
+    """Fits a diffusion on what is conditioned on what; returns it and its last metrics.
+
+    Args:
+        key: consumed.
+        config: sizes and fit.
+        archive: latents and conditions.
+        saver: where an interrupted fit goes on from.
+        task: progress.
+    """
     statistics = diffusion.latent_statistics(archive)
-    init_key, fit_key = jax.random.split(run.key("diffusion"))
-    params = diffusion.init_network(init_key, config, v_hat.shape[-1])
+    init_key, fit_key = jax.random.split(key)
+    params = diffusion.init_network(init_key, config, archive.v_hat.shape[-1])
     chunk = fit.make_fit_chunk(
         diffusion.make_diffusion_loss(config),
         diffusion.make_sample_fn(config, statistics),
         config.fit,
         max(1, config.fit.steps // 20),
     )
-    state, metrics = run_fit(
-        "diffusion",
-        config.fit,
-        chunk,
-        fit.init_fit(fit_key, params, config.fit),
-        archive,
-        Saver(run.path("diffusion", "unfinished")),
-        task,
-    )
-    checkpoint.save(run.path("diffusion", "model"), DiffusionParams(state.ema, statistics))
-    return metrics
+    state = fit.init_fit(fit_key, params, config.fit)
+    state, metrics = run_fit("diffusion", config.fit, chunk, state, archive, saver, task)
+    return DiffusionParams(state.ema, statistics), metrics
 
 
 def load_diffusion(run: Run) -> DiffusionParams:
@@ -194,49 +210,88 @@ def load_pretrained(run: Run) -> tuple[bert_weights.Encoder, Any]:
         return bert_weights.load_encoder(source), bert_weights.load_tokenizer(source)
 
 
-def fit_translator(run: Run, task: StageProgress) -> dict[str, Any]:
-    """Stage 5: fine-tunes BERT on the training sentences, then fits the translation."""
-    config = run.config.translator
-    language = load_task_language(run)
-    encoder, tokenizer = load_pretrained(run)
+def prepare_instructions(run: Run, encoder: bert_weights.Encoder) -> translator.SentenceData:
+    """The training sentences after the frozen part of the encoder."""
+    config, (_, tokenizer) = run.config.translator, load_pretrained(run)
     instructions = run.instructions()
     sentences = [s for style in instructions.values() for s in style.train]
     labels = [i for i, style in enumerate(instructions.values()) for _ in style.train]
     ids, mask = bert_weights.tokenize(tokenizer, sentences, config.maximum_length)
-    prepared = translator.prepare_sentences(encoder, config, ids, mask, np.array(labels))
+    return translator.prepare_sentences(encoder, config, ids, mask, np.array(labels))
+
+
+def fit_translator(run: Run, task: StageProgress) -> dict[str, Any]:
+    """Stage 5: fine-tunes BERT on the training sentences, then fits the translation."""
+    config = run.config.translator
+    language = load_task_language(run)
+    encoder, _ = load_pretrained(run)
+    prepared = prepare_instructions(run, encoder)
     keys = jax.random.split(run.key("translator"), 5)
     tuned, first = _fit_part(
-        run,
-        task,
         "fine-tuning",
         config.fine_tuning,
         translator.make_fine_tuning(encoder.architecture, config),
-        translator.init_fine_tuning(keys[0], encoder, config, len(instructions)),
+        translator.init_fine_tuning(keys[0], encoder, config, len(run.env.style_names)),
         keys[1],
         prepared,
-        offset=0,
-    )
-    data = translator.prepare_translation(
-        keys[2], tuned, encoder.architecture, config, prepared, language.v_hat
-    )
-    vae, second = _fit_part(
-        run,
+        Saver(run.path("translator", "unfinished_fine_tuning")),
         task,
-        "translation",
-        config.translation,
-        translator.make_translation(config),
-        translator.init_translation(
-            keys[3], encoder.architecture, config, language.v_hat.shape[-1]
-        ),
-        keys[4],
-        data,
+    )
+    vae, second = fit_translation(
+        keys[2:],
+        config,
+        encoder.architecture,
+        tuned,
+        prepared,
+        language.v_hat,
+        Saver(run.path("translator", "unfinished_translation")),
+        task,
         offset=config.fine_tuning.steps,
     )
     checkpoint.save(run.path("translator", "model"), {"fine_tuned": tuned, "vae": vae})
     return {**{f"fine_tuning_{k}": v for k, v in first.items()}, **second}
 
 
-def _fit_part(run, task, name, config, functions, params, key, data, *, offset):
+def fit_translation(
+    keys: jax.Array,
+    config: translator.TranslatorConfig,
+    architecture: BertArchitecture,
+    tuned: Any,
+    prepared: translator.SentenceData,
+    v_hat: jax.Array,
+    saver: Saver,
+    task: StageProgress,
+    *,
+    offset: int = 0,
+) -> tuple[Any, dict[str, float]]:
+    """Fits the translation's VAE on sentences; returns its parameters and last metrics.
+
+    Args:
+        keys: three; consumed.
+        config: the translator's.
+        architecture: the encoder's.
+        tuned: the encoder's last layers and the classifier, as `init_fine_tuning` makes them.
+        prepared: the sentences.
+        v_hat: task language of each style, [style, U].
+        saver: where an interrupted fit goes on from.
+        task: progress.
+        offset: steps of the stage before this fit.
+    """
+    data = translator.prepare_translation(keys[0], tuned, architecture, config, prepared, v_hat)
+    return _fit_part(
+        "translation",
+        config.translation,
+        translator.make_translation(config),
+        translator.init_translation(keys[1], architecture, config, v_hat.shape[-1]),
+        keys[2],
+        data,
+        saver,
+        task,
+        offset=offset,
+    )
+
+
+def _fit_part(name, config, functions, params, key, data, saver, task, *, offset=0):
     """One of the translator's two fits."""
     loss_fn, sample_fn = functions
     chunk = fit.make_fit_chunk(loss_fn, sample_fn, config, max(1, config.steps // 10))
@@ -246,7 +301,7 @@ def _fit_part(run, task, name, config, functions, params, key, data, *, offset):
         chunk,
         fit.init_fit(key, params, config),
         data,
-        Saver(run.path("translator", f"unfinished_{name.replace('-', '_')}")),
+        saver,
         task,
         offset=offset,
     )

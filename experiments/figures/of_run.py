@@ -6,62 +6,21 @@ from typing import Any
 
 import matplotlib
 import numpy as np
-from matplotlib.axes import Axes
-from matplotlib.backends.backend_agg import FigureCanvasAgg
 from matplotlib.figure import Figure
 
-from experiments.summary import (
-    HEADLINE,
-    METHODS,
-    ORACLE,
-    UNIVERSAL,
-    UNIVERSAL_WITH_LABEL,
-    WRONG,
-    mean,
-    ratios,
-    returns,
-    shares,
-    spread,
+from experiments.figures.style import (
+    STYLE,
+    TARGET,
+    draw_cell_borders,
+    fills_of,
+    label_styles,
+    new_figure,
+    save,
+    words,
+    wrap,
 )
+from experiments.summary import HEADLINE, METHODS, ORACLE, mean, ratios, returns, shares, spread
 from experiments.summary import ordered_methods as methods_of
-
-_DOTS_PER_INCH = 150
-_TARGET = 0.95
-_STYLE: dict[Any, Any] = {
-    "font.size": 9,
-    "font.family": "DejaVu Sans",
-    "axes.titlesize": 9,
-    "axes.labelsize": 9,
-    "legend.fontsize": 8.5,
-    "xtick.labelsize": 8.5,
-    "ytick.labelsize": 8.5,
-    "axes.spines.top": False,
-    "axes.spines.right": False,
-    "axes.linewidth": 0.8,
-    "hatch.linewidth": 0.6,
-    "pdf.fonttype": 42,
-}
-# Colours that differ in lightness as well, so that they survive a grey print.
-_FILLS = {
-    ORACLE: ("#575757", ""),
-    "Best response": ("#8a8a8a", ""),
-    "VAE reconstruction": ("#b8b8b8", ""),
-    "Diffusion, true task language": ("#e2e2e2", ""),
-    "Haland, training sentences": ("#8fc1e3", ""),
-    HEADLINE: ("#2a6cb6", ""),
-    WRONG: ("#ffffff", "////"),
-    UNIVERSAL: ("#c9d8c0", ""),
-    UNIVERSAL_WITH_LABEL: ("#6f8f6b", ""),
-}
-_OTHER_FILLS = (
-    ("#e8b96a", ""),
-    ("#b5651d", ""),
-    ("#f6e3c0", ".."),
-    ("#e6efe2", "xx"),
-    ("#9a7b4f", "//"),
-    ("#dccfe6", ".."),
-    ("#c3a6cf", ""),
-)
 
 
 def draw_figures(results: Mapping[str, Any], folder: str | Path) -> list[Path]:
@@ -80,22 +39,20 @@ def draw_figures(results: Mapping[str, Any], folder: str | Path) -> list[Path]:
     for name, (needed, draw) in FIGURES.items():
         if any(key not in results for key in needed):
             continue
-        with matplotlib.rc_context(_STYLE):
+        with matplotlib.rc_context(STYLE):
             figure = draw(results)
             if figure is None:
                 continue
-            figure.savefig(folder / f"{name}.png", dpi=_DOTS_PER_INCH)
-            figure.savefig(folder / f"{name}.pdf", metadata={"CreationDate": None})
-        drawn.append(folder / f"{name}.png")
+            drawn.append(save(figure, folder, name))
     return drawn
 
 
 def share_of_oracle(results: Mapping[str, Any]) -> Figure:
     """Return divided by the Oracle's, a bar a method, a dot a held-out seed."""
     methods = methods_of(results)
-    figure = _figure(7.2, 0.9 + 0.32 * len(methods))
+    figure = new_figure(7.2, 0.9 + 0.32 * len(methods))
     axes = figure.add_subplot()
-    fills = _fills(methods)
+    fills = fills_of(methods)
     for row, method in enumerate(methods):
         by_seed = np.asarray([mean(column) for column in ratios(results, method).T])
         centre = mean(ratios(results, method))
@@ -108,8 +65,8 @@ def share_of_oracle(results: Mapping[str, Any]) -> Figure:
         )  # fmt: skip
         label = "–" if np.isnan(centre) else f"{centre:.2f} ± {spread(by_seed):.2f}"
         axes.text(1.02, row, label, transform=axes.get_yaxis_transform(), va="center")
-    axes.axvline(_TARGET, color="#c02020", linewidth=1.0, linestyle="--")
-    axes.text(_TARGET, -0.62, f"aim {_TARGET}", ha="center", va="bottom", fontsize=8)
+    axes.axvline(TARGET, color="#c02020", linewidth=1.0, linestyle="--")
+    axes.text(TARGET, -0.62, f"aim {TARGET}", ha="center", va="bottom", fontsize=8)
     axes.set_yticks(range(len(methods)), methods)
     axes.set_ylim(len(methods) - 0.45, -0.62)
     axes.set_xlim(left=min(0.0, axes.get_xlim()[0]))
@@ -120,14 +77,14 @@ def share_of_oracle(results: Mapping[str, Any]) -> Figure:
 
 def returns_by_style(results: Mapping[str, Any]) -> Figure:
     """Bars of the return by style, one for each step from the Oracle to Haland."""
-    return _grouped_bars(results, [name for name in methods_of(results) if name in METHODS])
+    return grouped_bars(results, [name for name in methods_of(results) if name in METHODS])
 
 
 def comparisons_by_style(results: Mapping[str, Any]) -> Figure | None:
     """Bars of the return by style: Haland beside the ablations and baselines, if there are any."""
     others = [name for name in methods_of(results) if name not in METHODS]
     ours = [name for name in (ORACLE, HEADLINE) if name in methods_of(results)]
-    return _grouped_bars(results, [*ours, *others]) if others else None
+    return grouped_bars(results, [*ours, *others]) if others else None
 
 
 def learning_curves(results: Mapping[str, Any]) -> Figure:
@@ -136,7 +93,7 @@ def learning_curves(results: Mapping[str, Any]) -> Figure:
     curves = results["curves"]["returns"]
     columns = min(4, len(curves))
     rows = -(-len(curves) // columns)
-    figure = _figure(2.3 * columns + 0.5, 1.75 * rows + 0.45)
+    figure = new_figure(2.3 * columns + 0.5, 1.75 * rows + 0.45)
     grid = figure.subplots(rows, columns, sharex=True, sharey=True, squeeze=False)
     scale, unit = (1e6, " (millions)") if steps.max() >= 1e6 else (1e3, " (thousands)")
     for axes, (style, seeds) in zip(grid.flat, curves.items(), strict=False):
@@ -148,7 +105,7 @@ def learning_curves(results: Mapping[str, Any]) -> Figure:
         )
         axes.plot(steps / scale, seeds.T, color="#6d6d6d", linewidth=0.5, alpha=0.7)
         axes.plot(steps / scale, centre, color="#1f5fa8", linewidth=1.6)
-        axes.set_title(_words(style))
+        axes.set_title(words(style))
         axes.grid(axis="y", color="#dddddd", linewidth=0.6)
         axes.margins(x=0.01)
     for axes, above in zip(grid[-1], grid[-2] if rows > 1 else grid[-1], strict=True):
@@ -171,7 +128,7 @@ def task_language(results: Mapping[str, Any]) -> Figure:
     }
     tallest = max(len(indices) for indices in columns.values())
     width = 1.9 + 0.3 * len(results["styles"])
-    figure = _figure(width * len(players) + 0.8, 1.5 + 0.19 * tallest)
+    figure = new_figure(width * len(players) + 0.8, 1.5 + 0.19 * tallest)
     grid = figure.subplots(1, len(players), squeeze=False)[0]
     image = None
     for axes, player in zip(grid, players, strict=True):
@@ -179,10 +136,10 @@ def task_language(results: Mapping[str, Any]) -> Figure:
         image = axes.imshow(
             frequencies[:, indices].T, cmap="Blues", vmin=0, vmax=1, aspect="auto"
         )  # fmt: skip
-        names = [_words(events[index].partition(":")[2] or events[index]) for index in indices]
+        names = [words(events[index].partition(":")[2] or events[index]) for index in indices]
         axes.set_yticks(range(len(indices)), names, fontsize=7.5)
-        _label_styles(axes, results["styles"])
-        _draw_cell_borders(axes, len(indices), len(results["styles"]))
+        label_styles(axes, results["styles"])
+        draw_cell_borders(axes, len(indices), len(results["styles"]))
         if player:
             axes.set_title(f"events of the {player}")
     if image is not None:
@@ -201,7 +158,7 @@ def cross_play(results: Mapping[str, Any]) -> Figure:
     styles = results["styles"]
     oracle = np.broadcast_to(returns(results, ORACLE).mean(axis=1), values.shape)
     share = shares(values, oracle)
-    figure = _figure(2.6 + 0.62 * len(styles), 2.1 + 0.5 * len(styles))
+    figure = new_figure(2.6 + 0.62 * len(styles), 2.1 + 0.5 * len(styles))
     axes = figure.add_subplot()
     colours = matplotlib.colormaps["Blues"].with_extremes(bad="#eeeeee")
     image = axes.imshow(share, cmap=colours, vmin=0.0, vmax=1.0, aspect="auto")
@@ -213,9 +170,9 @@ def cross_play(results: Mapping[str, Any]) -> Figure:
             color="white" if of_oracle > 0.6 else "black", linespacing=1.1,
             fontweight="bold" if row == column else "normal",
         )  # fmt: skip
-    axes.set_yticks(range(len(styles)), [_words(style) for style in styles])
-    _label_styles(axes, styles)
-    _draw_cell_borders(axes, *values.shape)
+    axes.set_yticks(range(len(styles)), [words(style) for style in styles])
+    label_styles(axes, styles)
+    draw_cell_borders(axes, *values.shape)
     axes.set_ylabel("ego: best response to the style")
     axes.set_xlabel("held-out partners of the style")
     bar = figure.colorbar(image, ax=axes, shrink=0.8, aspect=25, pad=0.02)
@@ -224,11 +181,12 @@ def cross_play(results: Mapping[str, Any]) -> Figure:
     return figure
 
 
-def _grouped_bars(results: Mapping[str, Any], methods: Sequence[str]) -> Figure:
+def grouped_bars(results: Mapping[str, Any], methods: Sequence[str]) -> Figure:
+    """Bars of the return by style, a bar a method, with deviations over seeds."""
     styles = results["styles"]
-    figure = _figure(max(6.0, 1.35 * len(styles)), 3.9)
+    figure = new_figure(max(6.0, 1.35 * len(styles)), 3.9)
     axes = figure.add_subplot()
-    fills = _fills(methods)
+    fills = fills_of(methods)
     width = 0.84 / len(methods)
     for index, method in enumerate(methods):
         values = returns(results, method)  # [style, seed]
@@ -239,7 +197,7 @@ def _grouped_bars(results: Mapping[str, Any], methods: Sequence[str]) -> Figure:
             edgecolor="black", linewidth=0.5, ecolor="black",
             error_kw={"elinewidth": 0.9, "capsize": 1.5},
         )  # fmt: skip
-    axes.set_xticks(range(len(styles)), [_wrap(style) for style in styles])
+    axes.set_xticks(range(len(styles)), [wrap(style) for style in styles])
     axes.tick_params(axis="x", length=0)
     axes.set_axisbelow(True)
     axes.grid(axis="y", color="#dddddd", linewidth=0.6)
@@ -249,51 +207,8 @@ def _grouped_bars(results: Mapping[str, Any], methods: Sequence[str]) -> Figure:
     return figure
 
 
-def _fills(methods: Sequence[str]) -> dict[str, tuple[str, str]]:
-    others = [name for name in methods if name not in _FILLS]
-    extra = {name: _OTHER_FILLS[i % len(_OTHER_FILLS)] for i, name in enumerate(others)}
-    return {name: _FILLS.get(name) or extra[name] for name in methods}
-
-
-def _figure(width: float, height: float) -> Figure:
-    """A figure, in inches, that no interactive session knows of."""
-    figure = Figure(figsize=(width, height), layout="constrained")
-    FigureCanvasAgg(figure)
-    return figure
-
-
-def _label_styles(axes: Axes, styles: Sequence[str]) -> None:
-    axes.set_xticks(range(len(styles)), [_words(style) for style in styles])
-    for label in axes.get_xticklabels():
-        label.set(rotation=40, ha="right", rotation_mode="anchor")
-
-
-def _draw_cell_borders(axes: Axes, rows: int, columns: int) -> None:
-    axes.set_xticks(np.arange(columns + 1) - 0.5, minor=True)
-    axes.set_yticks(np.arange(rows + 1) - 0.5, minor=True)
-    axes.grid(which="minor", color="white", linewidth=0.8)
-    axes.tick_params(which="both", length=0)
-    for spine in axes.spines.values():
-        spine.set_visible(False)
-
-
 def _player(event: str) -> str:
     return event.partition(":")[0] if ":" in event else ""
-
-
-def _words(name: str) -> str:
-    return name.replace("_", " ").replace("@", " @ ")
-
-
-def _wrap(name: str) -> str:
-    """A style's name on as many lines as it needs under a group of bars."""
-    lines = [""]
-    for word in name.split("_"):
-        if lines[-1] and len(lines[-1]) + len(word) >= 14:
-            lines.append(word)
-        else:
-            lines[-1] = f"{lines[-1]} {word}".strip()
-    return "\n".join(lines)
 
 
 # Name of the file -> what of results.json it needs, and the function that draws it.

@@ -1,0 +1,97 @@
+"""Draws the paper's figures from the results of runs, and nothing else.
+
+    python -m experiments.figures runs/*-overnight-0 --out figures
+    python -m experiments.figures docs/results/*/*
+
+Each as PNG and PDF: Fig. 3 (all methods in all environments), 4 (Adaptive Egos by seed), 6a and 6b
+(sentences), 8 to 11 (events), Table 1. Those whose numbers are missing are named with the
+command that makes them.
+"""
+
+import dataclasses
+import json
+import time
+from pathlib import Path
+from typing import Annotated, Any
+
+import tyro
+from rich.console import Console
+from rich.table import Table
+
+from experiments.errors import UserError, main_guard
+
+MISSING = {
+    "figure_4": "python -m experiments.compare RUN --methods universal",
+    "figure_6a": "python -m experiments.compare RUN --methods no-fine-tuning",
+    "table_1": "python -m experiments.compare RUN --methods cgan-mlp cgan-unet no-translator "
+    "no-vae",
+}
+"""The command that measures what a figure needs."""
+
+
+@dataclasses.dataclass(frozen=True)
+class Arguments:
+    """Draw the paper's figures from the results of runs."""
+
+    runs: Annotated[tuple[Path, ...], tyro.conf.Positional, tyro.conf.arg(metavar="RUN")]
+    """Folders with a results.json, one an environment."""
+    out: Annotated[Path, tyro.conf.arg(metavar="FOLDER")] = Path("figures")
+    """Where the figures go."""
+
+
+@main_guard
+def main() -> None:
+    """The command."""
+    arguments = tyro.cli(Arguments, prog="python -m experiments.figures")
+    if not arguments.runs:
+        raise UserError("name at least one run: a folder with a results.json")
+    # Matplotlib takes a second to import.
+    from experiments.figures import paper
+
+    start = time.monotonic()
+    runs = read_runs(arguments.runs)
+    drawn = paper.draw_paper(runs, arguments.out)
+    console = Console()
+    table = Table(title=f"figures of {len(runs)} environments, {time.monotonic() - start:.0f} s")
+    for column in ("figure", "what", "files"):
+        table.add_column(column)
+    for name, files in drawn.items():
+        shown = "\n".join(file.name for file in files)
+        missing = MISSING.get(name)
+        hint = f"[yellow]missing; first: {missing}[/]" if missing else "[yellow]missing[/]"
+        table.add_row(name.replace("_", " "), paper.FIGURES[name].title, shown or hint)
+    console.print(table)
+    more = paper.improvement(runs)
+    if more["best"] == more["best"]:
+        console.print(
+            f"Haland earns {more['best']:+.1%} beside the best universal ego of each environment, "
+            f"{more['each']:+.1%} beside each of them, on average (the paper states +89.64%)."
+        )
+
+
+def read_runs(folders: tuple[Path, ...]) -> list[dict[str, Any]]:
+    """The results of runs, in the order of their environments' names.
+
+    Raises:
+        UserError: a folder has no results.json, it is damaged, or two are of one environment.
+    """
+    found: dict[str, dict[str, Any]] = {}
+    for folder in folders:
+        file = folder / "results.json"
+        try:
+            results = json.loads(file.read_text(encoding="utf-8"))
+        except OSError as error:
+            raise UserError(
+                f"{file} cannot be read ({error.strerror}); name folders of runs"
+            ) from None
+        except ValueError as error:
+            raise UserError(f"{file} is damaged ({error}); make the run again") from None
+        name = results["environment"]
+        if name in found:
+            raise UserError(f"{folder} is another run of {name}; name one of each environment")
+        found[name] = results
+    return [found[name] for name in sorted(found)]
+
+
+if __name__ == "__main__":
+    main()

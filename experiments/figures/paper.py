@@ -1,0 +1,301 @@
+"""The paper's figures and Table 1 from the results of several runs."""
+
+from collections.abc import Callable, Iterable, Mapping, Sequence
+from pathlib import Path
+from typing import Any, NamedTuple
+
+import matplotlib
+import numpy as np
+from matplotlib.figure import Figure
+from matplotlib.lines import Line2D
+
+from experiments.figures.of_run import grouped_bars, task_language
+from experiments.figures.style import (
+    STYLE,
+    draw_cell_borders,
+    fills_of,
+    label_styles,
+    new_figure,
+    save,
+    words,
+)
+from experiments.intervals import Estimate, estimate
+from experiments.markdown import table
+from experiments.summary import (
+    COMPARISONS,
+    HEADLINE,
+    ORACLE,
+    WRONG,
+    mean,
+    ordered_methods,
+    ratios,
+    returns,
+    shares,
+    spread,
+)
+
+ADAPTIVE = "Adaptive Ego"
+EGOS = ("General Ego", "Instructed Ego", ADAPTIVE, "Self-play", "FCP", *COMPARISONS)
+"""Universal egos; further methods that no run of ours knows follow them."""
+ABLATIONS = ("CGAN (MLP)", "CGAN (UNet)", "Without translator", "Without VAE")
+"""The columns of Table 1 after Oracle and Haland."""
+TRAINING = "Haland, training sentences"
+NOT_COMPARED = (
+    *("Best response", "VAE reconstruction", "Diffusion, true task language", TRAINING, WRONG),
+    "Without fine-tuning",
+)
+"""Steps of Haland itself and controls, which have figures of their own."""
+Results = Mapping[str, Any]
+
+
+class Drawing(NamedTuple):
+    """A figure of the paper.
+
+    Attributes:
+        title: what it shows.
+        runs: picks the runs that have what it needs.
+        draw: makes a figure of each, or one of all.
+        together: whether one figure shows all runs.
+    """
+
+    title: str
+    runs: Callable[[Results], bool]
+    draw: Callable[..., Figure]
+    together: bool = False
+
+
+def compared(runs: Iterable[Results]) -> list[str]:
+    """The methods of Fig. 3: Haland, the universal egos, then any others that are not ours."""
+    found = dict.fromkeys(name for run in runs for name in ordered_methods(run))
+    left_out = (ORACLE, HEADLINE, *NOT_COMPARED, *ABLATIONS)
+    egos = [name for name in EGOS if name in found]
+    others = [name for name in found if name not in (*left_out, *EGOS)]
+    return [HEADLINE, *egos, *others]
+
+
+def estimates(runs: Sequence[Results], method: str) -> Estimate | None:
+    """The interquartile mean of a method's share of the Oracle over runs, styles and seeds.
+
+    None where a run lacks the method.
+    """
+    if any(method not in run["methods"] for run in runs):
+        return None
+    rows = [row for run in runs for row in ratios(run, method)]
+    widest = max(len(row) for row in rows)
+    return estimate(np.array([np.pad(row, (0, widest - len(row)), constant_values=np.nan)
+                              for row in rows]))  # fmt: skip
+
+
+def normalised_returns(runs: Sequence[Results]) -> Figure:
+    """Fig. 3: share of the Oracle by environment and method, with 95% intervals."""
+    methods = compared(runs)
+    groups: dict[str, Sequence[Results]] = {_short(run): [run] for run in runs}
+    if len(runs) > 1:
+        groups["all"] = runs
+    figure = new_figure(max(6.0, 1.7 * len(groups)), 3.6)
+    axes = figure.add_subplot()
+    fills = fills_of(methods)
+    width = 0.84 / len(methods)
+    for index, method in enumerate(methods):
+        found = [estimates(group, method) for group in groups.values()]
+        places = [place for place, one in enumerate(found) if one is not None]
+        shown = [one for one in found if one is not None]
+        colour, hatch = fills[method]
+        axes.bar(
+            np.array(places) + (index - (len(methods) - 1) / 2) * width,
+            [one.value for one in shown], width, color=colour, hatch=hatch, edgecolor="black",
+            linewidth=0.5, ecolor="black", label=method.removesuffix(", test sentences"),
+            yerr=np.array([[one.value - one.low, one.high - one.value] for one in shown]).T,
+            error_kw={"elinewidth": 0.9, "capsize": 2},
+        )  # fmt: skip
+    axes.axhline(1.0, color="black", linewidth=0.8, linestyle=":")
+    axes.set_xticks(range(len(groups)), [words(name) for name in groups])
+    axes.tick_params(axis="x", length=0)
+    axes.set_axisbelow(True)
+    axes.grid(axis="y", color="#dddddd", linewidth=0.6)
+    axes.set_ylabel("return / Oracle (interquartile mean, 95%)")
+    figure.legend(loc="outside upper center", ncols=min(4, len(methods)), frameon=False)
+    return figure
+
+
+def adaptive_egos(results: Results) -> Figure:
+    """Fig. 4: return of each Adaptive Ego by training seed, below the Oracle's, by style."""
+    styles = results["styles"]
+    oracle = returns(results, ORACLE).mean(axis=1)
+    trained = results["compared"]["universal"]
+    played = np.asarray(trained["by_ego"][ADAPTIVE], float)  # [style, ego]
+    seeds = min(trained["seeds"], played.shape[1])
+    # An ego was asked for several times; its seeds came in turn.
+    by_seed = np.array([played[:, seed::seeds].mean(axis=1) for seed in range(seeds)])
+    values = np.concatenate([oracle[None], by_seed])
+    figure = new_figure(2.6 + 0.62 * len(styles), 1.6 + 0.5 * len(values))
+    axes = figure.add_subplot()
+    share = shares(values, np.broadcast_to(oracle, values.shape))
+    colours = matplotlib.colormaps["Blues"].with_extremes(bad="#eeeeee")
+    image = axes.imshow(share, cmap=colours, vmin=0.0, vmax=1.0, aspect="auto")
+    for (row, column), value in np.ndenumerate(values):
+        dark = share[row, column] > 0.6
+        axes.text(
+            column, row, f"{value:.0f}", ha="center", va="center", fontsize=8,
+            color="white" if dark else "black",
+        )  # fmt: skip
+    names = [ORACLE, *(f"{ADAPTIVE}, seed {seed}" for seed in range(seeds))]
+    axes.set_yticks(range(len(values)), names)
+    label_styles(axes, styles)
+    draw_cell_borders(axes, *values.shape)
+    bar = figure.colorbar(image, ax=axes, shrink=0.9, aspect=20, pad=0.02)
+    bar.set_label("share of the Oracle")
+    bar.outline.set_linewidth(0.6)  # pyright: ignore[reportCallIssue]
+    return figure
+
+
+def sentence_embedding(results: Results) -> Figure:
+    """Fig. 6a: t-SNE of translated sentences before and after BERT's fine-tuning."""
+    from sklearn.manifold import TSNE
+
+    translations = results["compared"]["no-fine-tuning"]["translations"]
+    figure = new_figure(7.2, 3.7)
+    panels = figure.subplots(1, 2)
+    colours = matplotlib.colormaps["tab10"]
+    for axes, (when, spoken) in zip(panels, translations.items(), strict=True):
+        train, test = (np.asarray(spoken[name], float) for name in ("train", "test"))
+        flat = np.concatenate([part.reshape(-1, part.shape[-1]) for part in (train, test)])
+        perplexity = min(15.0, (len(flat) - 1) / 4)
+        places = TSNE(perplexity=perplexity, init="pca", random_state=0).fit_transform(flat)
+        first = train.shape[0] * train.shape[1]
+        for part, marker, size, label in (
+            (places[:first].reshape(*train.shape[:2], 2), "o", 14, "training"),
+            (places[first:].reshape(*test.shape[:2], 2), "*", 70, "test"),
+        ):
+            for style, dots in enumerate(part):
+                axes.scatter(
+                    dots[:, 0], dots[:, 1], s=size, marker=marker, color=colours(style % 10),
+                    edgecolor="black", linewidth=0.4, label=label if style == 0 else None,
+                )  # fmt: skip
+        axes.set_title(f"{when} fine-tuning")
+        axes.set_xticks([])
+        axes.set_yticks([])
+    panels[0].legend(frameon=False, loc="best")
+    handles = [
+        Line2D([], [], color=colours(style % 10), marker="o", linestyle="none")
+        for style in range(len(results["styles"]))
+    ]
+    names = [words(style) for style in results["styles"]]
+    figure.legend(handles, names, loc="outside lower center", ncols=4, frameon=False)
+    return figure
+
+
+def sentences_by_style(results: Results) -> Figure:
+    """Fig. 6b: return from training and from test sentences, by style."""
+    methods = [ORACLE, TRAINING, HEADLINE]
+    methods += [name for name in ("Without fine-tuning",) if name in results["methods"]]
+    return grouped_bars(results, methods)
+
+
+def ablation_bars(results: Results) -> Figure:
+    """Table 1 as bars: return by style without a part of Haland."""
+    return grouped_bars(results, table_1_methods(results))
+
+
+def table_1_methods(results: Results) -> list[str]:
+    """The columns of Table 1 that were measured."""
+    return [
+        name for name in (ORACLE, HEADLINE, *ABLATIONS)
+        if name == ORACLE or name in results["methods"]
+    ]  # fmt: skip
+
+
+def table_1(results: Results) -> str:
+    """Table 1 in Markdown: return ± deviation over held-out seeds, by style."""
+    methods = table_1_methods(results)
+    measured = {method: returns(results, method) for method in methods}
+    rows = [
+        (words(style), *(f"{values[index].mean():.1f} ± {spread(values[index]):.1f}"
+                         for values in measured.values()))
+        for index, style in enumerate(results["styles"])
+    ]  # fmt: skip
+    share = (f"{mean(ratios(results, method)):.2f}" for method in methods)
+    rows.append(("**return / Oracle**", *share))
+    return table(("partner", *methods), rows, "l" + "r" * len(methods))
+
+
+def improvement(runs: Sequence[Results]) -> dict[str, float]:
+    """How much more Haland earns than others, on average over environments, as a share.
+
+    `best`: than the best universal ego of each environment; `each`: than each of them. The paper
+    states one number, 89.64%, and not how it was taken.
+    """
+    best, each = [], []
+    for run in runs:
+        others = [name for name in EGOS if name in run["methods"]]
+        if not others:
+            continue
+        ours = returns(run, HEADLINE).mean()
+        theirs = np.array([returns(run, name).mean() for name in others])
+        best.append(ours / theirs.max() - 1 if theirs.max() > 0 else np.nan)
+        each += [ours / one - 1 if one > 0 else np.nan for one in theirs]
+    return {"best": mean(np.array(best)), "each": mean(np.array(each))}
+
+
+def _short(results: Results) -> str:
+    return results["environment"].split("/")[-1]
+
+
+def _has(*names: str) -> Callable[[Results], bool]:
+    return lambda run: all(name in run["methods"] for name in names)
+
+
+FIGURES = {
+    "figure_3": Drawing(
+        "return of all methods in all environments", _has(HEADLINE), normalised_returns, True
+    ),
+    "figure_4": Drawing(
+        "Adaptive Egos by training seed, beside the Oracle",
+        lambda run: ADAPTIVE in run.get("compared", {}).get("universal", {}).get("by_ego", {}),
+        adaptive_egos,
+    ),
+    "figure_6a": Drawing(
+        "translated sentences before and after fine-tuning",
+        lambda run: "translations" in run.get("compared", {}).get("no-fine-tuning", {}),
+        sentence_embedding,
+    ),
+    "figure_6b": Drawing(
+        "return from training and test sentences", _has(TRAINING, HEADLINE), sentences_by_style
+    ),
+    "figure_8_to_11": Drawing(
+        "frequencies of events by style", lambda run: "task_language" in run, task_language
+    ),
+    "table_1": Drawing(
+        "Haland without its parts",
+        lambda run: any(name in run["methods"] for name in ABLATIONS),
+        ablation_bars,
+    ),
+}
+
+
+def draw_paper(runs: Sequence[Results], folder: Path) -> dict[str, list[Path]]:
+    """Draws all figures whose numbers are there.
+
+    Args:
+        runs: contents of results.json, one an environment.
+        folder: where the files go; made if it is missing.
+
+    Returns:
+        By figure, its files; a figure that no run has the numbers for has none.
+    """
+    folder.mkdir(parents=True, exist_ok=True)
+    drawn: dict[str, list[Path]] = {}
+    for name, drawing in FIGURES.items():
+        having = [run for run in runs if drawing.runs(run)]
+        drawn[name] = []
+        with matplotlib.rc_context(STYLE):
+            if drawing.together and having:
+                drawn[name].append(save(drawing.draw(having), folder, name))
+            for run in [] if drawing.together else having:
+                drawn[name].append(save(drawing.draw(run), folder, f"{name}_{_short(run)}"))
+    for run in runs:
+        if FIGURES["table_1"].runs(run):
+            file = folder / f"table_1_{_short(run)}.md"
+            file.write_text(f"{table_1(run)}\n", encoding="utf-8")
+            drawn["table_1"].append(file)
+    return drawn
