@@ -26,6 +26,8 @@ class Adaptation:
         joint: settings of the joint training that differ.
         refit: settings of the best responses' refits that differ.
         partners: settings of the partners and best responses that differ.
+        universal_games: games in parallel of the universal egos by preset, where those of the
+            preset cannot be shared by the partners in equal parts.
         training: settings of every training that differ; with `normalise` the policy VAE
             compresses normalised policies too.
     """
@@ -36,6 +38,7 @@ class Adaptation:
     joint: Mapping[str, Any] = dataclasses.field(default_factory=dict)
     refit: Mapping[str, Any] = dataclasses.field(default_factory=dict)
     partners: Mapping[str, Any] = dataclasses.field(default_factory=dict)
+    universal_games: Mapping[str, int] = dataclasses.field(default_factory=dict)
     training: Mapping[str, Any] = dataclasses.field(default_factory=dict)
 
 
@@ -64,6 +67,7 @@ ADAPTATIONS = {
         # A universal ego learns little of scratching and bathing, and no style gains from it.
         # Persons who knew one robot only presented nothing to another that did as well.
         partners={"universal_start": False, "updates_together": 5},
+        universal_games={"overnight": 256},
         training={
             "normalise": True,
             "entropy": 0.001,
@@ -171,6 +175,7 @@ def _adapted(config: RunConfig) -> RunConfig:
 
     partners, universal, compression = config.partners, config.universal, config.compression
     normalised = change.training.get("normalise", compression.vae.normalised)
+    games = change.universal_games.get(config.preset, universal.training.num_envs)
     return dataclasses.replace(
         config,
         max_steps=min(config.max_steps, change.max_steps),
@@ -184,7 +189,9 @@ def _adapted(config: RunConfig) -> RunConfig:
         compression=dataclasses.replace(
             compression, vae=dataclasses.replace(compression.vae, normalised=normalised)
         ),
-        universal=dataclasses.replace(universal, training=changed(universal.training)),
+        universal=dataclasses.replace(
+            universal, training=changed(universal.training, num_envs=games)
+        ),
     )
 
 

@@ -17,7 +17,7 @@ from experiments.methods import METHODS
 
 ROOT = Path(__file__).parent.parent
 EXAMPLE = ROOT / "docs" / "examples" / "retrieval.py"
-STEPS = 1300
+STEPS = 8000
 
 pytestmark = [pytest.mark.timeout(1500), pytest.mark.light_compilation]
 
@@ -94,8 +94,11 @@ def test_what_is_measured_is_not_measured_again(compared_run, tmp_path):
     made = (copy / "results.json").read_bytes()
     compare.measure(copy, compare.NAMES, STEPS, 2, EXAMPLE)
     assert (copy / "results.json").read_bytes() == made
-    with pytest.raises(UserError, match="'fcp' with steps = 1,300 already, not 2,000; remove its"):
-        compare.measure(copy, ("fcp",), 2000, 2)
+    with pytest.raises(UserError, match="'fcp' with steps = 8,000 already, not 9,000; remove its"):
+        compare.measure(copy, ("fcp",), 9000, 2)
+    (copy / "method_fcp" / "metrics.json").unlink()
+    with pytest.raises(UserError, match="steps is 5,000; fictitious co-play needs at least 7,680"):
+        compare.measure(copy, ("fcp",), 5000, 2)
     with pytest.raises(UserError, match="'self-play' with seeds = 2 already, not 3"):
         compare.measure(copy, ("self-play",), STEPS, 3)
 

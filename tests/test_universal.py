@@ -9,9 +9,10 @@ import numpy as np
 import pytest
 from toy_game import ToyGame, always
 
+import envs
 from envs.base import Pair
 from envs.labelled import Labelled, LabelledStyle
-from experiments import configs, training
+from experiments import configs, run_all, training
 from haland_jax import networks, partners, ppo, rollout, universal
 from haland_jax.learner import StylesByGame, init_learner, learner_from, make_networks
 from haland_jax.partners import Player
@@ -192,11 +193,13 @@ def test_partners_that_cannot_share_the_games_are_refused():
         )
 
 
+@pytest.mark.parametrize("environment", run_all.asked_environments(run_all.ALL))
 @pytest.mark.parametrize("preset", configs.PRESETS)
-def test_the_presets_share_the_games_of_eight_styles_in_equal_parts(preset):
-    config = configs.PRESETS[preset]("overcooked/crossway", 0)
+def test_the_presets_share_the_games_of_eight_styles_in_equal_parts(preset, environment):
+    config = configs.PRESETS[preset](environment, 0)
     # Every styled kitchen has one mirror, so each partner has one image.
-    teachers = 2 * config.partners.known_seeds
+    images = 1 + len(envs.make(environment).symmetries)
+    teachers = images * config.partners.known_seeds
     assert config.partners.refit.num_envs % teachers == 0
     training = config.universal.training
     assert training.num_envs % (8 * teachers) == 0

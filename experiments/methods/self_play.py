@@ -120,10 +120,11 @@ class FictitiousCoPlay:
 
     def _configs(self, run: Run, steps: int) -> tuple[PPOConfig, PPOConfig]:
         styles = len(run.env.style_names)
-        return (
-            training_config(run, steps // 2 // POOL, styles),
-            training_config(run, steps // 2, styles * POOL * len(MOMENTS)),
-        )
+        pool = training_config(run, steps // 2 // POOL, styles)
+        if pool.num_updates < 2:
+            least = 4 * POOL * pool.steps_per_update
+            raise ValueError(f"steps is {steps:,}; fictitious co-play needs at least {least:,}")
+        return pool, training_config(run, steps // 2, styles * POOL * len(MOMENTS))
 
     def _pool(self, given: Given, config: PPOConfig, key: jax.Array) -> Policy:
         """The partners at all moments, leading axis [partner]."""
