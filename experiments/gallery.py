@@ -16,13 +16,19 @@ EPISODES = "figures/episodes"
 GIF_STEPS = 200
 GAMES_TO_CHOOSE_FROM = 5
 SECONDS_AT_THE_END = 1.0
+STRIP = 6
+"""Moments of a game in its strip."""
 
 
-def record_episodes(run: Run, task: StageProgress) -> None:
+def record_episodes(run: Run, task: StageProgress) -> dict[str, Any]:
     """Writes `figures/episodes/<style>.gif` and a picture of one moment for every style.
 
     Of a few games the one with the median return is shown, so that the picture is typical.
+
+    Returns:
+        By style the sentence, the game's return and its `moments`, for results.json.
     """
+    episodes = {}
     env = run.env
     haland, population = load_haland(run), load_population(run)
     instructions = run.instructions()
@@ -48,7 +54,62 @@ def record_episodes(run: Run, task: StageProgress) -> None:
         game = jax.tree.map(np.asarray, _at(games, typical))
         save_episode(env, folder / f"{name}.gif", game, name, sentence, steps=GIF_STEPS)
         save_moment(env, folder / f"{name}.png", game, name, sentence, step=GIF_STEPS // 2)
+        episodes[name] = {
+            "sentence": sentence,
+            "return": float(game.rewards.sum()),
+            "moments": moments(env, game),
+        }
         task.update(index + 1)
+    return episodes
+
+
+def moments(env: DrawnEnvironment, game: Recording) -> list[dict[str, Any]]:
+    """The moments of a game that tell what both players do: each skill when it was first shown.
+
+    Where there are more than `STRIP`, some are left out evenly; where there are fewer, others
+    without a name join them.
+
+    Args:
+        env: the environment.
+        game: what `rollout.record` returned, as NumPy arrays.
+
+    Returns:
+        In the order of their time: `step`, `skill` ("" for none), `score` until then, and `state`,
+        the leaves of the state after it (`state_of`).
+    """
+    shown: dict[tuple[int, str], int] = {}
+    for step, player, event in zip(*np.nonzero(game.events > 0), strict=True):
+        skill = env.event_names[event].split("@")[0].replace("_", " ")
+        if not skill.startswith("stand"):
+            shown.setdefault((int(player), skill), int(step))
+    first = sorted((step, player, skill) for (player, skill), step in shown.items())
+    if len(first) > STRIP:
+        first = [
+            first[place] for place in np.linspace(0, len(first) - 1, STRIP).round().astype(int)
+        ]
+    named = [(step + 1, f"{('ego', 'partner')[player]}: {skill}") for step, player, skill in first]
+    last = _moments(game) - 1
+    taken = {min(step, last) for step, _ in named}
+    others = [step for step in np.linspace(0, last, STRIP).round().astype(int) if step not in taken]
+    named += [(int(step), "") for step in others[: STRIP - len(named)]]
+    scores = np.concatenate([[0.0], np.cumsum(game.rewards)])
+    return [
+        {
+            "step": min(step, last),
+            "skill": skill,
+            "score": float(scores[step]),
+            "state": [leaf[min(step, last)].tolist() for leaf in jax.tree.leaves(game.states)],
+        }
+        for step, skill in sorted(named)
+    ]
+
+
+def state_of(env: DrawnEnvironment, leaves: list[Any]) -> Any:
+    """The state of a game from its leaves as results.json has them."""
+    like, _ = jax.eval_shape(env.reset, jax.random.key(0), env.style(env.style_names[0]))
+    shapes, structure = jax.tree.flatten(like)
+    arrays = [np.asarray(leaf, shape.dtype) for leaf, shape in zip(leaves, shapes, strict=True)]
+    return jax.tree.unflatten(structure, arrays)
 
 
 def _at(tree: Any, index: Any) -> Any:

@@ -53,7 +53,8 @@ def run_pipeline(config: RunConfig, path: Path) -> dict[str, Any]:
             results = collect_results(run)
             folder.write_json("results.json", results)
             with progress.stage(REPORT, len(run.env.style_names)) as task:
-                record_episodes(run, task)
+                results["episodes"] = record_episodes(run, task)
+                folder.write_json("results.json", results)
                 report.write_report(results, path)
             folder.finish_stage(REPORT, {})
     return results

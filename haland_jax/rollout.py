@@ -92,6 +92,7 @@ class Recording(PyTreeNode):
         observations: `Pair` of observations before each step, [T, O].
         actions: `Pair` of actions, [T].
         rewards: team reward, float32 [T].
+        events: what each player did in each step, float32 [T, player, event].
         alive: whether the game was still on, bool [T].
     """
 
@@ -99,6 +100,7 @@ class Recording(PyTreeNode):
     observations: Pair
     actions: Pair
     rewards: jax.Array
+    events: jax.Array
     alive: jax.Array
 
 
@@ -198,7 +200,8 @@ def record(
         actions = draw_actions(act_key, distributions, greedy=greedy)
         following, timestep = env.step(env_key, state, actions, style)
         reward = timestep.reward * alive
-        kept = Recording(state, observation, actions, reward, alive)
+        events = jnp.asarray(timestep.events, jnp.float32) * alive
+        kept = Recording(state, observation, actions, reward, events, alive)
         shown = shown_action(env, actions.partner)
         return (following, timestep.observation, memory, shown, alive & ~timestep.done), kept
 

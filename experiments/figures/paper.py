@@ -10,6 +10,7 @@ from matplotlib.figure import Figure
 from matplotlib.lines import Line2D
 
 from experiments.figures.of_run import grouped_bars, task_language
+from experiments.figures.strips import strip_of_all, strip_of_two
 from experiments.figures.style import (
     STYLE,
     draw_cell_borders,
@@ -253,6 +254,12 @@ FIGURES = {
         "Adaptive Egos by training seed, beside the Oracle",
         lambda run: ADAPTIVE in run.get("compared", {}).get("universal", {}).get("by_ego", {}),
         adaptive_egos,
+    ),
+    "figure_5": Drawing(
+        "what both players do, two styles", lambda run: "episodes" in run, strip_of_two
+    ),
+    "figure_12": Drawing(
+        "what both players do, all styles", lambda run: "episodes" in run, strip_of_all
     ),
     "figure_6a": Drawing(
         "translated sentences before and after fine-tuning",

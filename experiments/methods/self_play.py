@@ -129,8 +129,12 @@ class FictitiousCoPlay:
     def _pool(self, given: Given, config: PPOConfig, key: jax.Array) -> Policy:
         """The partners at all moments, leading axis [partner]."""
         env = given.env
-        start = self_play.init_self_play(env, config, key, POOL)
-        beginners = trained_players(start).partner.actor
+
+        def start() -> TrainState:
+            return self_play.init_self_play(env, config, key, POOL)
+
+        # The training consumes its start, so the beginners are of another, equal one.
+        beginners = trained_players(start()).partner.actor
         middle = given.path("middle")
 
         def keep_middle(state: TrainState) -> TrainState:
@@ -141,7 +145,7 @@ class FictitiousCoPlay:
         players, _ = train_population(
             env,
             config,
-            lambda: start,
+            start,
             self_play.all_styles_for(env, POOL),
             given.saver(f"pool_{config.num_updates}_updates"),
             given.task.update,
