@@ -53,9 +53,10 @@ def main() -> None:
     runs = read_runs(arguments.runs)
     drawn = paper.draw_paper(runs, arguments.out)
     console = Console()
-    table = Table(title=f"figures of {len(runs)} environments, {time.monotonic() - start:.0f} s")
+    environments = f"{len(runs)} environment{'s' * (len(runs) != 1)}"
+    table = Table(title=f"figures of {environments}, {time.monotonic() - start:.0f} s")
     for column in ("figure", "what", "files"):
-        table.add_column(column)
+        table.add_column(column, overflow="fold")
     for name, files in drawn.items():
         shown = "\n".join(file.name for file in files)
         missing = MISSING.get(name)

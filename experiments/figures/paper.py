@@ -47,6 +47,8 @@ NOT_COMPARED = (
 )
 """Steps of Haland itself and controls, which have figures of their own."""
 Results = Mapping[str, Any]
+_MARKERS = "osD^vPX*<>"
+"""Of styles, so that they can be told apart in grey."""
 
 
 class Drawing(NamedTuple):
@@ -77,14 +79,14 @@ def compared(runs: Iterable[Results]) -> list[str]:
 def estimates(runs: Sequence[Results], method: str) -> Estimate | None:
     """The interquartile mean of a method's share of the Oracle over runs, styles and seeds.
 
-    None where a run lacks the method.
+    None where a run lacks the method, or no partner's Oracle earns anything.
     """
     if any(method not in run["methods"] for run in runs):
         return None
     rows = [row for run in runs for row in ratios(run, method)]
     widest = max(len(row) for row in rows)
-    return estimate(np.array([np.pad(row, (0, widest - len(row)), constant_values=np.nan)
-                              for row in rows]))  # fmt: skip
+    padded = [np.pad(row, (0, widest - len(row)), constant_values=np.nan) for row in rows]
+    return estimate(np.array(padded)) if np.isfinite(padded).any() else None
 
 
 def normalised_returns(runs: Sequence[Results]) -> Figure:
@@ -101,6 +103,8 @@ def normalised_returns(runs: Sequence[Results]) -> Figure:
         found = [estimates(group, method) for group in groups.values()]
         places = [place for place, one in enumerate(found) if one is not None]
         shown = [one for one in found if one is not None]
+        if not shown:
+            continue
         colour, hatch = fills[method]
         axes.bar(
             np.array(places) + (index - (len(methods) - 1) / 2) * width,
@@ -115,7 +119,8 @@ def normalised_returns(runs: Sequence[Results]) -> Figure:
     axes.set_axisbelow(True)
     axes.grid(axis="y", color="#dddddd", linewidth=0.6)
     axes.set_ylabel("return / Oracle (interquartile mean, 95%)")
-    figure.legend(loc="outside upper center", ncols=min(4, len(methods)), frameon=False)
+    if axes.containers:
+        figure.legend(loc="outside upper center", ncols=min(4, len(methods)), frameon=False)
     return figure
 
 
@@ -164,22 +169,22 @@ def sentence_embedding(results: Results) -> Figure:
         perplexity = min(15.0, (len(flat) - 1) / 4)
         places = TSNE(perplexity=perplexity, init="pca", random_state=0).fit_transform(flat)
         first = train.shape[0] * train.shape[1]
-        for part, marker, size, label in (
-            (places[:first].reshape(*train.shape[:2], 2), "o", 14, "training"),
-            (places[first:].reshape(*test.shape[:2], 2), "*", 70, "test"),
-        ):
-            for style, dots in enumerate(part):
+        parts = (
+            places[:first].reshape(*train.shape[:2], 2),
+            places[first:].reshape(*test.shape[:2], 2),
+        )
+        for dots, size, edge in zip(parts, (18, 60), ("none", "black"), strict=True):
+            for style, (of_style, marker) in enumerate(zip(dots, _MARKERS, strict=False)):
                 axes.scatter(
-                    dots[:, 0], dots[:, 1], s=size, marker=marker, color=colours(style % 10),
-                    edgecolor="black", linewidth=0.4, label=label if style == 0 else None,
+                    of_style[:, 0], of_style[:, 1], s=size, marker=marker, linewidth=0.9,
+                    color=colours(style % 10), edgecolor=edge,
                 )  # fmt: skip
-        axes.set_title(f"{when} fine-tuning")
+        axes.set_title(f"{when} fine-tuning (large, edged: test sentences)")
         axes.set_xticks([])
         axes.set_yticks([])
-    panels[0].legend(frameon=False, loc="best")
     handles = [
-        Line2D([], [], color=colours(style % 10), marker="o", linestyle="none")
-        for style in range(len(results["styles"]))
+        Line2D([], [], color=colours(style % 10), marker=marker, linestyle="none")
+        for style, marker in zip(range(len(results["styles"])), _MARKERS, strict=False)
     ]
     names = [words(style) for style in results["styles"]]
     figure.legend(handles, names, loc="outside lower center", ncols=4, frameon=False)

@@ -28,6 +28,8 @@ CGAN_MLP, CGAN_UNET = "CGAN (MLP)", "CGAN (UNet)"
 NO_TRANSLATOR, NO_VAE = "Without translator", "Without VAE"
 SENTENCE_TOKENS = 8
 """Tokens that a sentence's embedding becomes."""
+LEAST_DEVIATION = 1e-3
+"""Of a dimension of the embeddings, which are of the order of 0.1."""
 LEAST_LOG_VARIANCE = -14.0
 """Of parameters that are diffused without a VAE; some are the same in all policies."""
 
@@ -118,7 +120,9 @@ class WithoutTranslator:
         embed = _pretrained_embedding(given.run)
         sentences = given.sentences
         embedded = embed([sentence for style in sentences for sentence in style])
-        mean, deviation = embedded.mean(axis=0), embedded.std(axis=0)
+        mean = embedded.mean(axis=0)
+        # MiniLM has dimensions that are the same for every sentence.
+        deviation = jnp.maximum(embedded.std(axis=0), LEAST_DEVIATION)
         embedded = ((embedded - mean) / deviation).reshape(len(sentences), -1, mean.shape[0])
         policies, spoken = posterior.mean.shape[0] // len(sentences), embedded.shape[1]
         archive = LatentArchive(
