@@ -15,6 +15,7 @@ METHODS; docs/methods.md shows one.
 import dataclasses
 import importlib.util
 import time
+import zlib
 from pathlib import Path
 from typing import Annotated, Any
 
@@ -98,6 +99,7 @@ def measure(
     """
     from experiments import report
     from experiments.finished_run import open_run
+    from experiments.judge import Judge
     from experiments.methods import METHODS
     from experiments.stages import Run
 
@@ -110,6 +112,8 @@ def measure(
         RunProgress(stages.values(), folder) as progress,
     ):
         run = Run(config, folder)
+        # One for all methods, since it compiles the games.
+        judge = Judge(run.env, config.evaluation.games, config.evaluation.batch)
         results = folder.read_json("results.json")
         steps = steps or int(results["universal"]["best_response_steps"])
         asked = {"asked_steps": steps, "seeds": seeds}
@@ -123,7 +127,7 @@ def measure(
                 with as_user_error():
                     updates = method.num_updates(run, steps)
                 with progress.stage(stage, updates) as task:
-                    found = _measure(run, method, name, stage, task, asked)
+                    found = _measure(run, judge, method, stage, task, asked)
                 folder.finish_stage(stage, {**found, "seconds": time.monotonic() - start})
             found = dict(folder.stage_metrics(stage))
             results["methods"] |= found.pop("methods")
@@ -169,21 +173,19 @@ def _expect_same(name: str, stage: str, found: dict[str, Any], asked: dict[str, 
 
 
 def _measure(
-    run: Any, method: Any, name: str, stage: str, task: StageProgress, asked: dict[str, int]
+    run: Any, judge: Any, method: Any, stage: str, task: StageProgress, asked: dict[str, int]
 ) -> dict[str, Any]:
     """Trains one method and plays its egos with the held-out partners."""
-    from experiments.judge import Judge, by_style, over_egos
+    from experiments.judge import by_style, over_egos
     from experiments.methods import Given, Told
     from experiments.stages import load_population
 
-    number = sum(ord(letter) * 31**place for place, letter in enumerate(name)) % 2**31
-    root = jax.random.fold_in(jax.random.key(run.config.seed), number)
+    root = jax.random.fold_in(jax.random.key(run.config.seed), zlib.crc32(stage.encode()) >> 1)
     train_key, make_key, play_key = jax.random.split(root, 3)
     given = Given(run, train_key, asked["asked_steps"], asked["seeds"], stage, task)
     with as_user_error():
         trained = method.train(given)
-    config = run.config.evaluation
-    judge = Judge(run.env, config.games, config.batch)
+    held_out = load_population(run).held_out_partners
     sentences = [style.test for style in run.instructions().values()]
     methods, by_ego = {}, {}
     for place, (shown, make) in enumerate(trained.egos.items()):
@@ -191,11 +193,10 @@ def _measure(
         egos = [
             [
                 make(Told(sentence, style, count), next(keys))
-                for count, sentence in enumerate(spoken * config.samples)
+                for count, sentence in enumerate(spoken * run.config.evaluation.samples)
             ]
             for style, spoken in enumerate(sentences)
         ]
-        held_out = load_population(run).held_out_partners
         scores = judge.with_held_out(jax.random.fold_in(play_key, place), _stacked(egos), held_out)
         methods[shown] = by_style(over_egos(scores), run.env.style_names)
         by_ego[shown] = scores.returns.mean(axis=1)  # [style, ego]
