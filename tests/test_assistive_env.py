@@ -11,7 +11,7 @@ import pytest
 from jax.interpreters.partial_eval import dce_jaxpr
 
 import envs
-from envs.assistive import model, scene, viewer
+from envs.assistive import control, model, physics, scene, viewer
 from envs.base import Pair
 
 STEPS = 40
@@ -273,3 +273,15 @@ def test_an_impossible_moment_is_not_drawn(env, games):
     broken = moment.replace(body=moment.body.replace(angles=np.full(13, np.nan)))
     with pytest.raises(ValueError, match="expected 13 finite numbers"):
         viewer.draw_state(env, broken)
+
+
+def test_one_that_stays_still_comes_back_to_where_games_start():
+    home = jnp.asarray(model.HOME)
+    away = jnp.zeros(len(model.JOINTS)).at[7].set(0.02).at[8].set(-0.3)
+    body = physics.at_rest(home + away, jnp.zeros(3))
+    back = control.speeds_back_home(body)
+    # What is 0.02 rad away is back after a step of 0.1 s at 0.2 of 0.63 rad/s, the other as fast
+    # as it can.
+    expected = np.zeros(len(model.JOINTS))
+    expected[7], expected[8] = -0.2 / control.FULL_SPEED, 1.0
+    np.testing.assert_allclose(back, expected, atol=1e-5)

@@ -29,3 +29,12 @@ def velocities(physics: Physics, actions: jax.Array, ranges: jax.Array) -> jax.A
     kept = jnp.clip(kept, -FULL_SPEED, FULL_SPEED)
     most = model.largest_speed_errors()
     return jnp.clip(kept, physics.speeds - most, physics.speeds + most)
+
+
+def speeds_back_home(physics: Physics) -> jax.Array:
+    """Returns the actions by which joints come back to where games start, -1 to 1 [joint].
+
+    Without gravity a servo that only keeps a speed of zero lets itself be pushed anywhere.
+    """
+    away = jnp.asarray(model.HOME) - physics.angles
+    return jnp.clip(away / (model.CONTROL_SECONDS * FULL_SPEED), -1.0, 1.0)

@@ -66,7 +66,8 @@ class Assistive:
         posture_spread: how far the ranges of the person's joints may be shifted, rad; drawn for
             each game. Without it an ego knows only the posture that its own partner prefers.
         still: `ego` or `partner`, whose actions then count for nothing, to learn what the other
-            one can do alone; None where both act.
+            one can do alone: it holds itself as at a game's start, also where it is pushed; None
+            where both act.
         reward: weights of the reward's terms.
         shaping: weights of the shaped reward.
     """
@@ -237,7 +238,8 @@ class Assistive:
         del key
         self._check_actions(actions)
         if self.still is not None:
-            actions = actions._replace(**{self.still: jnp.zeros_like(getattr(actions, self.still))})
+            home = Pair(*jnp.split(control.speeds_back_home(state.body), [len(model.ARM)]))
+            actions = actions._replace(**{self.still: getattr(home, self.still)})
         wanted = jnp.clip(jnp.concatenate([actions.ego, actions.partner]), -1.0, 1.0)
         ranges = style.ranges + state.habit[:, None]
         velocities = control.velocities(state.body, wanted, ranges)
