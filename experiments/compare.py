@@ -14,6 +14,8 @@ METHODS; docs/methods.md shows one.
 
 import dataclasses
 import importlib.util
+import math
+import sys
 import time
 import zlib
 from pathlib import Path
@@ -26,13 +28,12 @@ from rich.console import Console
 from rich.table import Table
 
 from experiments import devices
+from experiments.compared import STAGE, refuse_taken_names, with_compared
 from experiments.errors import UserError, as_user_error, choose, main_guard
-from experiments.progress import RunProgress, StageProgress
+from experiments.progress import RunProgress
 from experiments.run_folder import RunFolder
 from experiments.summary import ORACLE, summarise
 
-COMPARED = "compared"
-"""Where results.json says what the methods were trained with."""
 NAMES = (
     *("universal", "self-play", "fcp"),
     *("cgan-mlp", "cgan-unet", "no-translator", "no-vae", "no-fine-tuning"),
@@ -100,43 +101,47 @@ def measure(
     from experiments import report
     from experiments.finished_run import open_run
     from experiments.judge import Judge
-    from experiments.methods import METHODS
+    from experiments.methods import METHODS, Given
     from experiments.stages import Run
 
     RunFolder.read(path, ("report",))
     config = open_run(path).config
     chosen = {name: METHODS[name] for name in names} | (read_methods(added) if added else {})
-    stages = {name: f"method_{name}" for name in chosen}
+    stages = {name: f"{STAGE}{name}" for name in chosen}
     with (
         RunFolder.write(path, config) as folder,
         RunProgress(stages.values(), folder) as progress,
     ):
         run = Run(config, folder)
-        # One for all methods, since it compiles the games.
-        judge = Judge(run.env, config.evaluation.games, config.evaluation.batch)
         results = folder.read_json("results.json")
         steps = steps or int(results["universal"]["best_response_steps"])
-        asked = {"asked_steps": steps, "seeds": seeds}
-        for number, (name, method) in enumerate(chosen.items()):
+        budgets = {
+            name: {"asked_steps": steps, "seeds": seeds} if method.budgeted else {}
+            for name, method in chosen.items()
+        }
+        # All that can be wrong with what was asked for is said before anything is trained.
+        updates: dict[str, int | None] = {}
+        for name, method in chosen.items():
+            if folder.stage_done(stages[name]):
+                _expect_same(name, stages[name], folder.stage_metrics(stages[name]), budgets[name])
+            with as_user_error():
+                updates[name] = method.num_updates(run, steps)
+        # One for all methods, since it compiles the games.
+        judge = Judge(run.env, config.evaluation.games, config.evaluation.batch)
+        for name, method in chosen.items():
             stage = stages[name]
             if folder.stage_done(stage):
                 progress.skip(stage)
-                _expect_same(name, stage, folder.stage_metrics(stage), asked)
-            else:
-                start = time.monotonic()
-                with as_user_error():
-                    updates = method.num_updates(run, steps)
-                with progress.stage(stage, updates) as task:
-                    found = _measure(run, judge, method, stage, task, asked)
-                folder.finish_stage(stage, {**found, "seconds": time.monotonic() - start})
-            found = dict(folder.stage_metrics(stage))
-            results["methods"] |= found.pop("methods")
-            descriptions = results.get("descriptions", {}) | found.pop("descriptions")
-            results["descriptions"] = descriptions
-            results[COMPARED] = results.get(COMPARED, {}) | {name: found}
+                continue
+            start = time.monotonic()
+            with progress.stage(stage, updates[name]) as task:
+                given = Given(run, _key_of(run, stage), steps, seeds, stage, task)
+                found = _measure(judge, method, name, given)
+            found = {**found, **budgets[name], "seconds": time.monotonic() - start}
+            folder.finish_stage(stage, found)
+            results = with_compared(results, folder)
             folder.write_json("results.json", results)
-            if number == len(chosen) - 1:
-                report.write_report(results, path)
+            report.write_report(results, path)
     return results
 
 
@@ -148,10 +153,11 @@ def read_methods(file: Path) -> dict[str, Any]:
     """
     if not file.is_file():
         raise UserError(f"{file} is missing; name a Python file that defines METHODS")
-    spec = importlib.util.spec_from_file_location(file.stem, file)
+    spec = importlib.util.spec_from_file_location(f"added_{file.stem}", file)
     if spec is None or spec.loader is None:
         raise UserError(f"{file} is no Python file; its name has to end in .py")
     module = importlib.util.module_from_spec(spec)
+    sys.modules[spec.name] = module  # dataclasses look their module up
     spec.loader.exec_module(module)
     methods = getattr(module, "METHODS", None)
     if not isinstance(methods, dict) or not methods:
@@ -165,48 +171,50 @@ def read_methods(file: Path) -> dict[str, Any]:
 def _expect_same(name: str, stage: str, found: dict[str, Any], asked: dict[str, int]) -> None:
     """Checks that a finished method is the one that is asked for."""
     for what, value in asked.items():
-        if found[what] != value:
+        if found.get(what) != value:
             raise UserError(
                 f"the run has '{name}' with {what.removeprefix('asked_')} = {found[what]:,} "
                 f"already, not {value:,}; remove its folder '{stage}' to train it anew"
             )
 
 
-def _measure(
-    run: Any, judge: Any, method: Any, stage: str, task: StageProgress, asked: dict[str, int]
-) -> dict[str, Any]:
+def _key_of(run: Any, stage: str) -> jax.Array:
+    """The method's own key, whichever methods ran before."""
+    return jax.random.fold_in(jax.random.key(run.config.seed), zlib.crc32(stage.encode()) >> 1)
+
+
+def _measure(judge: Any, method: Any, name: str, given: Any) -> dict[str, Any]:
     """Trains one method and plays its egos with the held-out partners."""
     from experiments.judge import by_style, over_egos
-    from experiments.methods import Given, Told
+    from experiments.methods import Told
     from experiments.stages import load_population
 
-    root = jax.random.fold_in(jax.random.key(run.config.seed), zlib.crc32(stage.encode()) >> 1)
-    train_key, make_key, play_key = jax.random.split(root, 3)
-    given = Given(run, train_key, asked["asked_steps"], asked["seeds"], stage, task)
-    with as_user_error():
-        trained = method.train(given)
+    run = given.run
+    train_key, make_key, play_key = jax.random.split(given.key, 3)
+    trained = method.train(dataclasses.replace(given, key=train_key))
+    refuse_taken_names(name, list(trained.egos))
     held_out = load_population(run).held_out_partners
-    sentences = [style.test for style in run.instructions().values()]
+    sentences = [list(style.test) for style in run.instructions().values()]
     methods, by_ego = {}, {}
     for place, (shown, make) in enumerate(trained.egos.items()):
-        keys = iter(jax.random.split(jax.random.fold_in(make_key, place), 10_000))
-        egos = [
-            [
-                make(Told(sentence, style, count), next(keys))
-                for count, sentence in enumerate(spoken * run.config.evaluation.samples)
-            ]
-            for style, spoken in enumerate(sentences)
-        ]
+        egos = []
+        for style, spoken in enumerate(sentences):
+            number = len(spoken) * run.config.evaluation.samples
+            if method.budgeted:  # every trained ego as often as any other
+                number = math.lcm(number, given.seeds)
+            root = jax.random.fold_in(jax.random.fold_in(make_key, place), style)
+            keys = jax.random.split(root, number)
+            told = (Told(spoken[i % len(spoken)], style, i) for i in range(number))
+            egos.append([make(one, key) for one, key in zip(told, keys, strict=True)])
         scores = judge.with_held_out(jax.random.fold_in(play_key, place), _stacked(egos), held_out)
         methods[shown] = by_style(over_egos(scores), run.env.style_names)
         by_ego[shown] = scores.returns.mean(axis=1)  # [style, ego]
     return {
+        **trained.notes,
         "methods": methods,
         "by_ego": by_ego,
         "descriptions": trained.descriptions,
         "steps": trained.steps,
-        **asked,
-        **trained.notes,
     }
 
 

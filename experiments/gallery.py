@@ -18,6 +18,7 @@ GAMES_TO_CHOOSE_FROM = 5
 SECONDS_AT_THE_END = 1.0
 STRIP = 6
 """Moments of a game in its strip."""
+PLAYERS = {(0,): "ego", (1,): "partner", (0, 1): "both"}
 
 
 def record_episodes(run: Run, task: StageProgress) -> dict[str, Any]:
@@ -77,17 +78,28 @@ def moments(env: DrawnEnvironment, game: Recording) -> list[dict[str, Any]]:
         In the order of their time: `step`, `skill` ("" for none), `score` until then, and `state`,
         the leaves of the state after it (`state_of`).
     """
-    shown: dict[tuple[int, str], int] = {}
-    for step, player, event in zip(*np.nonzero(game.events > 0), strict=True):
-        skill = env.event_names[event].split("@")[0].replace("_", " ")
-        if not skill.startswith("stand"):
-            shown.setdefault((int(player), skill), int(step))
-    first = sorted((step, player, skill) for (player, skill), step in shown.items())
+    met: set[tuple[int, str]] = set()
+    first: list[tuple[int, str]] = []
+    for step, events in enumerate(game.events > 0):
+        new: dict[str, list[int]] = {}
+        for player, event in zip(*np.nonzero(events), strict=True):
+            skill = env.event_names[event].split("@")[0].replace("_", " ")
+            if (player, skill) not in met and not skill.startswith("stand"):
+                met.add((player, skill))
+                new.setdefault(skill, []).append(player)
+        # What a longer name says in the same step need not be said twice.
+        told = {
+            skill: players
+            for skill, players in new.items()
+            if not any(other != skill and other.startswith(skill) for other in new)
+        }
+        said = [f"{PLAYERS[tuple(players)]}: {skill}" for skill, players in told.items()]
+        if said:
+            first.append((step, said[0] if len(said) == 1 else "\n".join(said[:2])))
     if len(first) > STRIP:
-        first = [
-            first[place] for place in np.linspace(0, len(first) - 1, STRIP).round().astype(int)
-        ]
-    named = [(step + 1, f"{('ego', 'partner')[player]}: {skill}") for step, player, skill in first]
+        kept = np.linspace(0, len(first) - 1, STRIP).round().astype(int)
+        first = [first[place] for place in kept]
+    named = [(step + 1, skill) for step, skill in first]
     last = _moments(game) - 1
     taken = {min(step, last) for step, _ in named}
     others = [step for step in np.linspace(0, last, STRIP).round().astype(int) if step not in taken]

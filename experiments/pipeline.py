@@ -5,6 +5,7 @@ from pathlib import Path
 from typing import Any
 
 from experiments import report
+from experiments.compared import with_compared
 from experiments.configs import RunConfig
 from experiments.evaluation import evaluate
 from experiments.gallery import record_episodes
@@ -50,7 +51,7 @@ def run_pipeline(config: RunConfig, path: Path) -> dict[str, Any]:
             progress.skip(REPORT)
             results = folder.read_json("results.json")
         else:
-            results = collect_results(run)
+            results = with_compared(collect_results(run), folder)
             folder.write_json("results.json", results)
             with progress.stage(REPORT, len(run.env.style_names)) as task:
                 results["episodes"] = record_episodes(run, task)

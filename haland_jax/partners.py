@@ -76,7 +76,7 @@ class PartnersConfig:
         updates_together: updates after which every ego moves on to the next partner of its circle,
             so that partners learn to do with more than one ego; 0: pairs stay together. A style
             has two circles, which never meet: one of those that may become training partners, one
-            of those that may be held out. They share the spare seeds.
+            of those that may be held out. They share the spare seeds; an odd one is the former's.
         joint: training of partner and ego together.
         refit: training of an ego against all frozen partners of its style that are not held
             out.
@@ -110,7 +110,7 @@ class PartnersConfig:
             if getattr(self, name) < 0:
                 raise ValueError(f"{name} is {getattr(self, name)}; expected 0 or more")
         ppo.expect_equal_shares(
-            "refit", self.refit, self.known_seeds, "partners of train_seeds + spare_seeds"
+            "refit", self.refit, self.known_seeds, "partners that egos learn with"
         )
 
     @property

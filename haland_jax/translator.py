@@ -50,7 +50,7 @@ class TranslatorConfig:
     maximum_length: int = 32
     pooling: Pooling = "mean"
     trainable_layers: int = 3
-    dropout: float = 0.0
+    dropout: float = 0.1
     word_piece_dropout: float = 0.05
     fine_tuning_batch: int = 24
     translation_batch: int = 80

@@ -45,6 +45,7 @@ def counted_at_the_end(env):
     """Both players take food 1; the partner also stands somewhere, which is no skill."""
     events = np.zeros((2, len(env.event_names)), np.float32)
     events[:, env.event_names.index("take_food_1")] = 1
+    events[:, env.event_names.index("take_food@north")] = 1
     events[1, env.event_names.index("stand@north")] = 1
     return events
 
@@ -102,10 +103,10 @@ def test_the_moments_of_a_game_are_its_skills_and_some_in_between(env):
     found = gallery.moments(env, recording(env, 6))
     assert len(found) == gallery.STRIP
     named = [(moment["step"], moment["skill"], moment["score"]) for moment in found]
-    assert named[-2:] == [(6, "ego: take food 1", 1.0), (6, "partner: take food 1", 1.0)]
+    assert named[-1] == (6, "both: take food 1", 1.0)
     steps = [step for step, _, _ in named]
     assert steps == sorted(steps)
-    assert [skill for _, skill, _ in named[:-2]] == [""] * 4
+    assert [skill for _, skill, _ in named[:-1]] == [""] * 5
 
 
 def test_each_skill_is_shown_when_it_came_first_and_too_many_are_thinned_out(env):
@@ -142,6 +143,6 @@ def test_strips_show_the_moments_of_the_styles(env):
     figure = strips.strip_of_two(results)
     assert [part.get_suptitle()[:8] for part in figure.subfigs] == ["level 1:", "level 8:"]
     titles = [axes.get_title() for axes in figure.subfigs[0].axes]
-    assert titles[-1] == "step 6, partner:\ntake food 1"
-    assert titles[0] == "step 0"
+    assert titles[-1] == "step 6\nboth: take food 1"
+    assert titles[0].strip() == "step 0"
     assert len(strips.strip_of_all(results).subfigs) == 2

@@ -40,7 +40,6 @@ ORDER = (
     "deployment",
     "compact",
     "pretrained",
-    "ablations",
 )
 FORBIDDEN = {"utils", "util", "helpers", "helper", "common", "misc", "manager"}
 PYTHON_FILES = sorted(

@@ -286,6 +286,6 @@ def test_numbers_below_one_are_refused(name):
 
 def test_refit_games_must_be_shared_by_the_partners():
     odd = dataclasses.replace(CONFIG.refit, num_envs=32, total_steps=160)
-    message = r"refit\.num_envs is 32; expected a multiple of 7, .* train_seeds \+ spare_seeds"
+    message = r"refit\.num_envs is 32; expected a multiple of 7, .* that egos learn with"
     with pytest.raises(ValueError, match=message):
         PartnersConfig(train_seeds=5, refit=odd)

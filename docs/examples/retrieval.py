@@ -26,6 +26,8 @@ def similarity(one: set[str], other: set[str]) -> float:
 class Retrieval:
     """Plays the best response of the style that was asked for in the most similar words."""
 
+    budgeted = False  # no egos are trained
+
     def num_updates(self, run, steps):
         """One: it only reads the sentences."""
         return 1

@@ -66,8 +66,8 @@ class Assistive:
         posture_spread: how far the ranges of the person's joints may be shifted, rad; drawn for
             each game. Without it an ego knows only the posture that its own partner prefers.
         still: `ego` or `partner`, whose actions then count for nothing, to learn what the other
-            one can do alone: it holds itself as at a game's start, also where it is pushed; None
-            where both act.
+            one can do alone: its joints go to their home and stay there, also where they are
+            pushed; None where both act.
         reward: weights of the reward's terms.
         shaping: weights of the shaped reward.
     """

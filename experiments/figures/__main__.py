@@ -19,6 +19,7 @@ from rich.console import Console
 from rich.table import Table
 
 from experiments.errors import UserError, main_guard
+from experiments.figures import paper
 
 MISSING = {
     **dict.fromkeys(("figure_5", "figure_12"), "make the run again with this version"),
@@ -46,9 +47,6 @@ def main() -> None:
     arguments = tyro.cli(Arguments, prog="python -m experiments.figures")
     if not arguments.runs:
         raise UserError("name at least one run: a folder with a results.json")
-    # Matplotlib takes a second to import.
-    from experiments.figures import paper
-
     start = time.monotonic()
     runs = read_runs(arguments.runs)
     drawn = paper.draw_paper(runs, arguments.out)
@@ -88,6 +86,8 @@ def read_runs(folders: tuple[Path, ...]) -> list[dict[str, Any]]:
             ) from None
         except ValueError as error:
             raise UserError(f"{file} is damaged ({error}); make the run again") from None
+        if "environment" not in results or "methods" not in results:
+            raise UserError(f"{file} holds no results of a run; name folders of runs")
         name = results["environment"]
         if name in found:
             raise UserError(f"{folder} is another run of {name}; name one of each environment")

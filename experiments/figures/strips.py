@@ -35,7 +35,7 @@ def strips(results: Mapping[str, Any], styles: Sequence[str]) -> Figure:
     env = envs.make(results["environment"])
     pictures = {style: _pictures(env, style, results["episodes"][style]) for style in styles}
     height, width = next(iter(pictures.values()))[0].shape[:2]
-    row = WIDTH * height / width + 0.7
+    row = WIDTH * height / width + 0.8
     figure = new_figure(WIDTH * STRIP, row * len(styles))
     rows = figure.subfigures(len(styles), 1, squeeze=False)[:, 0]
     for part, (style, shown) in zip(rows, pictures.items(), strict=True):
@@ -47,8 +47,7 @@ def strips(results: Mapping[str, Any], styles: Sequence[str]) -> Figure:
             axes.set_axis_off()
         for axes, picture, moment in zip(strip, shown, episode["moments"], strict=False):
             axes.imshow(picture)
-            skill = f", {moment['skill']}".replace(": ", ":\n") if moment["skill"] else ""
-            axes.set_title(f"step {moment['step']}{skill}", fontsize=7.5, pad=3)
+            axes.set_title(f"step {moment['step']}\n{moment['skill']}", fontsize=7, pad=3)
     return figure
 
 

@@ -36,18 +36,26 @@ FILLS = {
     "Haland, training sentences": ("#8fc1e3", ""),
     HEADLINE: ("#2a6cb6", ""),
     WRONG: ("#ffffff", "////"),
+    "General Ego": ("#e8b96a", ""),
+    "Instructed Ego": ("#b5651d", ""),
+    "Adaptive Ego": ("#f6e3c0", ".."),
+    "Self-play": ("#dccfe6", ""),
+    "FCP": ("#8d6fa6", ""),
+    "CGAN (MLP)": ("#cfe8e6", ""),
+    "CGAN (UNet)": ("#5fa8a3", ""),
+    "Without translator": ("#cfe8e6", "xx"),
+    "Without VAE": ("#2f6f6b", ""),
+    "Without fine-tuning": ("#5fa8a3", "//"),
     UNIVERSAL: ("#c9d8c0", ""),
     UNIVERSAL_WITH_LABEL: ("#6f8f6b", ""),
 }
 OTHER_FILLS = (
-    ("#e8b96a", ""),
-    ("#b5651d", ""),
-    ("#f6e3c0", ".."),
-    ("#e6efe2", "xx"),
-    ("#9a7b4f", "//"),
-    ("#dccfe6", ".."),
-    ("#c3a6cf", ""),
+    ("#f3d6d6", ""),
+    ("#b54a4a", ""),
+    ("#f3d6d6", "oo"),
+    ("#7d2e2e", ""),
 )
+"""Of methods that are not ours."""
 
 
 def save(figure: Figure, folder: Path, name: str) -> Path:

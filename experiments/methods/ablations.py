@@ -41,6 +41,8 @@ class WithoutDiffusion:
         generator: `mlp`, or `unet`, as the diffusion has it.
     """
 
+    budgeted = False
+
     def __init__(self, generator: Literal["mlp", "unet"]):
         self.generator: Literal["mlp", "unet"] = generator
         self.name = CGAN_MLP if generator == "mlp" else CGAN_UNET
@@ -108,6 +110,8 @@ class WithoutDiffusion:
 class WithoutTranslator:
     """The diffusion is told a sentence's embedding by the pre-trained BERT, not its translation."""
 
+    budgeted = False
+
     def num_updates(self, run: Run, steps: int) -> int:
         """As many as the diffusion's fit has."""
         del steps
@@ -150,6 +154,8 @@ class WithoutTranslator:
 
 class WithoutVAE:
     """The diffusion makes a policy's parameters themselves."""
+
+    budgeted = False
 
     def num_updates(self, run: Run, steps: int) -> int:
         """As many as the diffusion's fit has."""

@@ -85,7 +85,7 @@ class Given:
 
     @property
     def partners(self) -> Policy:
-        """Actors of all partners that are not held out, leading axes [style, partner]."""
+        """Actors of all partners that the run's egos learn with, leading axes [style, partner]."""
         return partners.teachers(self.env, self.run.config.partners, load_population(self.run))
 
     @property
@@ -108,10 +108,20 @@ class Given:
 
 
 class Method(Protocol):
-    """A way to make egos for partners that are told of."""
+    """A way to make egos for partners that are told of.
+
+    Attributes:
+        budgeted: whether it trains `Given.seeds` egos for `Given.steps` steps each.
+    """
+
+    budgeted: bool
 
     def num_updates(self, run: Run, steps: int) -> int | None:
-        """How many updates `train` will report; None if that is not known."""
+        """How many updates `train` will report; None if that is not known.
+
+        Raises:
+            ValueError: `steps` are too few.
+        """
         ...
 
     def train(self, given: Given) -> Trained:

@@ -25,6 +25,8 @@ NO_FINE_TUNING = "Without fine-tuning"
 class WithoutFineTuning:
     """Only the VAE of Eq. 6 learns; the sentences' embeddings are the pre-trained BERT's."""
 
+    budgeted = False
+
     def num_updates(self, run: Run, steps: int) -> int:
         """Those of the VAE's fit."""
         del steps

@@ -43,6 +43,8 @@ def training_config(run: Run, steps: int, sharing: int) -> PPOConfig:
 class SelfPlay:
     """One ego and one partner of all styles learn together."""
 
+    budgeted = True
+
     def num_updates(self, run: Run, steps: int) -> int:
         """Updates of each pair."""
         return training_config(run, steps, len(run.env.style_names)).num_updates
@@ -82,6 +84,8 @@ class FictitiousCoPlay:
     Half of the steps make the pool, half go into the ego.
     """
 
+    budgeted = True
+
     def num_updates(self, run: Run, steps: int) -> int:
         """Updates of the pool and of the egos."""
         return sum(config.num_updates for config in self._configs(run, steps))
@@ -120,10 +124,10 @@ class FictitiousCoPlay:
 
     def _configs(self, run: Run, steps: int) -> tuple[PPOConfig, PPOConfig]:
         styles = len(run.env.style_names)
-        pool = training_config(run, steps // 2 // POOL, styles)
-        if pool.num_updates < 2:
-            least = 4 * POOL * pool.steps_per_update
+        least = 4 * POOL * training_config(run, 10**9, styles).steps_per_update
+        if steps < least:
             raise ValueError(f"steps is {steps:,}; fictitious co-play needs at least {least:,}")
+        pool = training_config(run, steps // 2 // POOL, styles)
         return pool, training_config(run, steps // 2, styles * POOL * len(MOMENTS))
 
     def _pool(self, given: Given, config: PPOConfig, key: jax.Array) -> Policy:
@@ -135,7 +139,7 @@ class FictitiousCoPlay:
 
         # The training consumes its start, so the beginners are of another, equal one.
         beginners = trained_players(start()).partner.actor
-        middle = given.path("middle")
+        middle = given.path(f"middle_of_{config.num_updates}_updates")
 
         def keep_middle(state: TrainState) -> TrainState:
             if int(state.update[0]) >= config.num_updates // 2 and not checkpoint.exists(middle):
@@ -150,7 +154,7 @@ class FictitiousCoPlay:
             given.saver(f"pool_{config.num_updates}_updates"),
             given.task.update,
             "the pool of fictitious co-play",
-            updates_per_piece=min(25, max(1, config.num_updates // 4)),
+            updates_per_piece=min(25, max(1, config.num_updates // 20)),
             between=keep_middle,
         )
         moments = (beginners, checkpoint.restore(middle, beginners), players.partner.actor)

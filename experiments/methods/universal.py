@@ -44,6 +44,8 @@ def training_config(run: Run, steps: int) -> PPOConfig:
 class RecurrentEgos:
     """All three of them, which learn in one program."""
 
+    budgeted = True
+
     def num_updates(self, run: Run, steps: int) -> int:
         """Updates of each."""
         return training_config(run, steps).num_updates
