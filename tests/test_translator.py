@@ -105,7 +105,7 @@ def test_classification_loss_equals_numpy():
 
 def test_fine_tuning_loss_is_the_cross_entropy_of_the_pooled_embedding():
     encoder = small_encoder()
-    config = dataclasses.replace(CONFIG, word_piece_dropout=0.0)
+    config = dataclasses.replace(CONFIG, dropout=0.0, word_piece_dropout=0.0)
     token_ids, mask, style = small_sentences()
     params = init_fine_tuning(jax.random.key(0), encoder, config, 3)
     data = prepare_sentences(encoder, config, token_ids, mask, style)
