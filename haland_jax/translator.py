@@ -23,7 +23,7 @@ from haland_jax.fit import FitConfig, LossFn, SampleFn
 
 Params = Any
 
-FINE_TUNING = FitConfig(learning_rate=2e-4, steps=100, warmup_steps=10)
+FINE_TUNING = FitConfig(learning_rate=1e-4, steps=200, warmup_steps=10)
 TRANSLATION = FitConfig(learning_rate=1e-4, steps=300, warmup_steps=20)
 
 
@@ -37,6 +37,7 @@ class TranslatorConfig:
         trainable_layers: how many of the encoder's last layers are fine-tuned.
         dropout: dropout inside the fine-tuned layers, in [0, 1).
         word_piece_dropout: chance, in [0, 1), that a word piece is hidden during fine-tuning.
+        classifier_rate: how many times as fast as the encoder the classifier learns, at least 1.
         fine_tuning_batch, translation_batch: sentences in a minibatch of Eq. 7 and Eq. 6.
         views: embeddings of each sentence that the VAE is fitted to: the plain one and
             `views - 1` with hidden word pieces.
@@ -52,6 +53,7 @@ class TranslatorConfig:
     trainable_layers: int = 3
     dropout: float = 0.1
     word_piece_dropout: float = 0.05
+    classifier_rate: float = 30.0
     fine_tuning_batch: int = 24
     translation_batch: int = 80
     views: int = 4
@@ -69,8 +71,8 @@ class TranslatorConfig:
             if not 0.0 <= getattr(self, name) < 1.0:
                 raise ValueError(f"{name} must be in [0, 1), found {getattr(self, name)}")
         least = dict.fromkeys(("trainable_layers", "views", "latent_dimension"), 1)
-        least |= {"fine_tuning_batch": 1, "translation_batch": 1, "maximum_length": 3}
-        for name, minimum in (least | {"kl_weight": 0}).items():
+        least |= {"fine_tuning_batch": 1, "translation_batch": 1, "classifier_rate": 1}
+        for name, minimum in (least | {"maximum_length": 3, "kl_weight": 0}).items():
             if getattr(self, name) < minimum:
                 raise ValueError(f"{name} must be at least {minimum}, found {getattr(self, name)}")
 
@@ -172,8 +174,7 @@ def prepare_sentences(
 
     `token_ids` and `mask` are [B, T], `style` [B] holds the index of each sentence's style.
 
-    Raises:
-        ValueError: if `trainable_layers` exceeds the encoder's layers.
+    Raises ValueError if `trainable_layers` exceeds the encoder's layers.
     """
     length = int(mask.sum(-1).max())
     token_ids, mask = jnp.asarray(token_ids[:, :length]), jnp.asarray(mask[:, :length])
@@ -195,15 +196,17 @@ def frozen_hidden(
     return bert.apply(variables, hidden, mask, stop=stop, method=Bert.run_layers)
 
 
-def classify(classifier: Params, embedding: jax.Array) -> jax.Array:
-    """Style logits [B, style] of sentence embeddings [B, W]."""
-    return embedding @ classifier["kernel"] + classifier["bias"]
+def classify(classifier: Params, embedding: jax.Array, config: TranslatorConfig) -> jax.Array:
+    """Style logits [B, style] of sentence embeddings [B, W].
+
+    The factor lets Adam, whose steps have the size of the learning rate, move the classifier
+    (new) faster than the encoder, which already knows the language.
+    """
+    return config.classifier_rate * (embedding @ classifier["kernel"] + classifier["bias"])
 
 
-def init_fine_tuning(
-    key: jax.Array, encoder: Encoder, config: TranslatorConfig, num_styles: int
-) -> Params:
-    """Parameters of Eq. 7: `encoder` (pre-trained last layers) and `classifier` (new).
+def init_fine_tuning(encoder: Encoder, config: TranslatorConfig, num_styles: int) -> Params:
+    """Parameters of Eq. 7: `encoder` (pre-trained last layers) and `classifier` (zeros).
 
     Raises:
         ValueError: if there are fewer than two styles, or more trainable layers than layers.
@@ -215,10 +218,10 @@ def init_fine_tuning(
     names = [f"layer_{index}" for index in range(first, layers)]
     if config.pooling == "pooler":
         names.append("pooler")
-    kernel = nn.initializers.lecun_normal()(key, (encoder.architecture.width, num_styles))
+    kernel, bias = jnp.zeros((encoder.architecture.width, num_styles)), jnp.zeros(num_styles)
     return {
         "encoder": {name: encoder.params["params"][name] for name in names},
-        "classifier": {"kernel": kernel, "bias": jnp.zeros(num_styles)},
+        "classifier": {"kernel": kernel, "bias": bias},
     }
 
 
@@ -233,12 +236,9 @@ def make_fine_tuning(
     def loss_fn(params: Params, key: jax.Array, batch: SentenceData):
         hide_key, dropout_key = jax.random.split(key)
         mask = hide_word_pieces(hide_key, batch.mask, config.word_piece_dropout)
-        if not config.dropout:
-            dropout_key = None
-        embedding = embed_hidden(
-            params["encoder"], architecture, config, batch.hidden, mask, dropout_key=dropout_key
-        )
-        logits = classify(params["classifier"], embedding)
+        inputs = (params["encoder"], architecture, config, batch.hidden, mask)
+        embedding = embed_hidden(*inputs, dropout_key=dropout_key if config.dropout else None)
+        logits = classify(params["classifier"], embedding, config)
         accuracy = (logits.argmax(-1) == batch.style).mean()
         return classification_loss(logits, batch.style), {"accuracy": accuracy}
 
@@ -375,7 +375,7 @@ def translate(
     num_events = params["vae"]["frequencies"]["bias"].shape[0]
     vae: Any = _vae(config, num_events)
     translated = vae.apply({"params": params["vae"]}, embedding)
-    return translated, classify(params["classifier"], embedding)
+    return translated, classify(params["classifier"], embedding, config)
 
 
 def _vae(config: TranslatorConfig, num_events: int) -> TranslationVAE:

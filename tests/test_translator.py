@@ -33,6 +33,7 @@ ARCHITECTURE = BertArchitecture(
 )
 CONFIG = TranslatorConfig(
     trainable_layers=2,
+    classifier_rate=2.0,
     fine_tuning_batch=6,
     translation_batch=12,
     views=2,
@@ -76,7 +77,7 @@ def translator():
     tuned, metrics = fitted(
         make_fine_tuning(ARCHITECTURE, CONFIG),
         CONFIG.fine_tuning,
-        init_fine_tuning(jax.random.key(0), encoder, CONFIG, 3),
+        init_fine_tuning(encoder, CONFIG, 3),
         sentences,
     )
     assert metrics["loss"].shape == (CONFIG.fine_tuning.steps,)
@@ -107,13 +108,15 @@ def test_fine_tuning_loss_is_the_cross_entropy_of_the_pooled_embedding():
     encoder = small_encoder()
     config = dataclasses.replace(CONFIG, dropout=0.0, word_piece_dropout=0.0)
     token_ids, mask, style = small_sentences()
-    params = init_fine_tuning(jax.random.key(0), encoder, config, 3)
+    params = init_fine_tuning(encoder, config, 3)
+    kernel = 0.1 * np.random.default_rng(0).normal(size=params["classifier"]["kernel"].shape)
+    params["classifier"] = {"kernel": jnp.asarray(kernel), "bias": jnp.array([0.1, 0.0, -0.1])}
     data = prepare_sentences(encoder, config, token_ids, mask, style)
     loss, metrics = make_fine_tuning(ARCHITECTURE, config)[0](params, jax.random.key(0), data)
     # The whole encoder in one piece, pooled and classified in NumPy.
     hidden = np.asarray(Bert(ARCHITECTURE).apply(encoder.params, token_ids, mask).hidden)
     embedding = np.stack([row[used].mean(0) for row, used in zip(hidden, mask, strict=True)])
-    logits = embedding @ np.asarray(params["classifier"]["kernel"])
+    logits = config.classifier_rate * (embedding @ kernel + np.array([0.1, 0.0, -0.1]))
     normaliser = np.log(np.exp(logits).sum(-1))
     expected = (normaliser - logits[np.arange(12), style]).mean()
     np.testing.assert_allclose(loss, expected, rtol=1e-4)
@@ -148,7 +151,7 @@ def test_the_frozen_part_and_the_rest_make_the_whole_encoder():
         config = dataclasses.replace(CONFIG, pooling=pooling)
         data = prepare_sentences(encoder, config, token_ids, mask, style)
         assert data.hidden.shape == (12, 8, 16)  # cut to the longest sentence
-        tuned = init_fine_tuning(jax.random.key(0), encoder, config, 3)["encoder"]
+        tuned = init_fine_tuning(encoder, config, 3)["encoder"]
         found = embed_hidden(tuned, ARCHITECTURE, config, data.hidden, data.mask)
         np.testing.assert_allclose(found, expected, atol=1e-5)
 
@@ -174,7 +177,7 @@ def test_the_views_repeat_sentences_and_targets():
     encoder = small_encoder()
     token_ids, mask, style = small_sentences()
     sentences = prepare_sentences(encoder, CONFIG, token_ids, mask, style)
-    tuned = init_fine_tuning(jax.random.key(0), encoder, CONFIG, 3)
+    tuned = init_fine_tuning(encoder, CONFIG, 3)
     data = prepare_translation(
         jax.random.key(1), tuned, ARCHITECTURE, CONFIG, sentences, FREQUENCIES
     )
@@ -223,7 +226,7 @@ def test_the_style_logits_are_the_classifiers(translator):
     encoder = Encoder(params={"params": translator.params["encoder"]}, architecture=ARCHITECTURE)
     data = prepare_sentences(encoder, CONFIG, token_ids, mask, style)
     embedding = embed_hidden(encoder.params["params"], ARCHITECTURE, CONFIG, data.hidden, data.mask)
-    expected = classify(translator.params["classifier"], embedding)
+    expected = classify(translator.params["classifier"], embedding, CONFIG)
     np.testing.assert_allclose(translator(token_ids, mask)[1], expected, atol=1e-4)
 
 
@@ -273,6 +276,7 @@ def test_something_else_than_a_list_of_sentences_is_refused(tokenizer, sentences
         ({"pooling": "max"}, "pooling must be"),
         ({"dropout": 1.0}, r"dropout must be in \[0, 1\)"),
         ({"word_piece_dropout": -0.1}, "word_piece_dropout"),
+        ({"classifier_rate": 0.5}, "classifier_rate must be at least 1"),
         ({"trainable_layers": 0}, "trainable_layers must be at least 1"),
         ({"views": 0}, "views must be at least 1"),
         ({"maximum_length": 2}, "maximum_length"),
@@ -287,7 +291,7 @@ def test_bad_settings_are_refused(change, message):
 def test_more_trainable_layers_than_layers_are_refused():
     config = dataclasses.replace(CONFIG, trainable_layers=4)
     with pytest.raises(ValueError, match="trainable_layers is 4, the encoder has only 3"):
-        init_fine_tuning(jax.random.key(0), small_encoder(), config, 3)
+        init_fine_tuning(small_encoder(), config, 3)
 
 
 @pytest.mark.parametrize(
@@ -297,6 +301,6 @@ def test_more_trainable_layers_than_layers_are_refused():
 def test_bad_frequencies_are_refused(frequencies, message):
     encoder = small_encoder()
     sentences = prepare_sentences(encoder, CONFIG, *small_sentences())
-    tuned = init_fine_tuning(jax.random.key(0), encoder, CONFIG, 3)
+    tuned = init_fine_tuning(encoder, CONFIG, 3)
     with pytest.raises(ValueError, match=message):
         prepare_translation(jax.random.key(1), tuned, ARCHITECTURE, CONFIG, sentences, frequencies)

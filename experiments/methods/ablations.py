@@ -198,7 +198,7 @@ def _pretrained_embedding(run: Run) -> Any:
     """Embeds sentences [B] by the encoder as it was pre-trained, float32 [B, W]."""
     encoder, tokenizer = load_pretrained(run)
     config, styles = run.config.translator, len(run.env.style_names)
-    layers = translator.init_fine_tuning(jax.random.key(0), encoder, config, styles)["encoder"]
+    layers = translator.init_fine_tuning(encoder, config, styles)["encoder"]
 
     def embed(sentences: list[str]) -> jax.Array:
         ids, mask = bert_weights.tokenize(tokenizer, sentences, config.maximum_length)

@@ -37,10 +37,9 @@ class WithoutFineTuning:
         run, config = given.run, given.run.config.translator
         language = load_task_language(run)
         encoder, _ = load_pretrained(run)
-        init_key, *fit_keys = jax.random.split(given.key, 4)
-        plain = translator.init_fine_tuning(init_key, encoder, config, len(given.sentences))
+        plain = translator.init_fine_tuning(encoder, config, len(given.sentences))
         vae, _ = fit_translation(
-            jnp.stack(fit_keys),
+            jax.random.split(given.key, 3),
             config,
             encoder.architecture,
             plain,

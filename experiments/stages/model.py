@@ -226,19 +226,19 @@ def fit_translator(run: Run, task: StageProgress) -> dict[str, Any]:
     language = load_task_language(run)
     encoder, _ = load_pretrained(run)
     prepared = prepare_instructions(run, encoder)
-    keys = jax.random.split(run.key("translator"), 5)
+    keys = jax.random.split(run.key("translator"), 4)
     tuned, first = _fit_part(
         "fine-tuning",
         config.fine_tuning,
         translator.make_fine_tuning(encoder.architecture, config),
-        translator.init_fine_tuning(keys[0], encoder, config, len(run.env.style_names)),
-        keys[1],
+        translator.init_fine_tuning(encoder, config, len(run.env.style_names)),
+        keys[0],
         prepared,
         Saver(run.path("translator", "unfinished_fine_tuning")),
         task,
     )
     vae, second = fit_translation(
-        keys[2:],
+        keys[1:],
         config,
         encoder.architecture,
         tuned,
@@ -317,7 +317,7 @@ def load_haland(run: Run) -> Haland:
     # Shapes alone: to compile and compute initial values would take most of the time.
     fine_tuned, vae = jax.eval_shape(
         lambda key: (
-            translator.init_fine_tuning(key, encoder, config, styles),
+            translator.init_fine_tuning(encoder, config, styles),
             translator.init_translation(key, encoder.architecture, config, events),
         ),
         jax.random.key(0),
