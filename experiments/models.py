@@ -4,7 +4,7 @@ from pathlib import Path
 
 from envs.instructions import Instructions, load_instructions
 from experiments.configs import DEFAULT_ENVIRONMENT
-from experiments.errors import as_user_error, choose
+from experiments.errors import UserError, as_user_error, choose
 from haland_jax import pretrained
 from haland_jax.bert_weights import EncoderWeightsError
 from haland_jax.pretrained import TrainedModel
@@ -27,6 +27,8 @@ def open_model(name: str) -> TrainedModel:
         environment = choose("pretrained model", name.removeprefix(PREFIX), pretrained.names())
         with as_user_error(EncoderWeightsError):
             return pretrained.load(environment)
+    if name in pretrained.names() and not Path(name).exists():
+        raise UserError(f"{name} is no folder of a run; the package's model is {PREFIX}{name}")
     return model_of_run(Path(name))
 
 

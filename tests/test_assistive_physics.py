@@ -5,6 +5,7 @@ import jax.numpy as jnp
 import mujoco
 import numpy as np
 import pytest
+from jax.sharding import Mesh, PartitionSpec
 
 from envs.assistive import control, model, physics
 
@@ -118,3 +119,17 @@ def test_the_games_had_contact(played):
 
 def test_forces_are_those_of_c(played):
     np.testing.assert_allclose(played["forces"], played["pushed"], atol=0.05)
+
+
+def test_the_model_serves_one_mesh_of_devices_after_another():
+    # Brax's PPO shares its games out over a mesh of its own, after ours has used the model.
+    model._stored.cache_clear()
+    for axis in ("member", "i"):
+        mesh, spec = Mesh(np.array(jax.devices()), (axis,)), PartitionSpec(axis)
+
+        def two_steps(seat: jax.Array) -> jax.Array:
+            return 2 * model.mjx_model_with(seat).opt.timestep + model.blank_data().time
+
+        shared_out = jax.shard_map(jax.vmap(two_steps), mesh=mesh, in_specs=spec, out_specs=spec)
+        found = jax.jit(shared_out)(jnp.zeros((2, 3)))
+        np.testing.assert_allclose(found, 2 * model.mujoco_model().opt.timestep, rtol=1e-6)

@@ -8,6 +8,7 @@ import functools
 from importlib import resources
 
 import jax
+import jax.numpy as jnp
 import mujoco
 import numpy as np
 
@@ -55,19 +56,26 @@ def mjx_model_with(seat: jax.Array) -> mjx.Model:
     return known.replace(body_pos=known.body_pos.at[seated].add(seat))
 
 
-@functools.cache
 def mjx_model() -> mjx.Model:
     """The model for MJX."""
-    # The first use may be inside a compiled function, whose values must not be kept.
-    with jax.ensure_compile_time_eval():
-        return mjx.put_model(mujoco_model())
+    return jax.tree.map(jnp.asarray, _stored()[0])
+
+
+def blank_data() -> mjx.Data:
+    """Data of the model, to be filled."""
+    return jax.tree.map(jnp.asarray, _stored()[1])
 
 
 @functools.cache
-def blank_data() -> mjx.Data:
-    """Data of the model, to be filled."""
+def _stored() -> tuple[mjx.Model, mjx.Data]:
+    """Model and blank data in NumPy arrays.
+
+    JAX's own must not be kept: the first use may be inside a compiled function, and arrays made
+    in one that is shared out belong to its mesh of devices.
+    """
     with jax.ensure_compile_time_eval():
-        return mjx.make_data(mjx_model())
+        known = mjx.put_model(mujoco_model())
+        return jax.tree.map(np.asarray, (known, mjx.make_data(known)))
 
 
 @functools.cache

@@ -1,0 +1,73 @@
+"""`experiments.sentences`: a style told from wordings that were left out of the fine-tuning."""
+
+import dataclasses
+
+import jax.numpy as jnp
+import numpy as np
+import pytest
+
+from experiments import sentences
+from experiments.errors import UserError
+from haland_jax.fit import FitConfig
+from haland_jax.translator import SentenceData, prepare_sentences
+from tests.test_translator import CONFIG, small_encoder, small_sentences
+
+QUICK = dataclasses.replace(CONFIG, fine_tuning=FitConfig(learning_rate=1e-2, steps=60))
+
+
+def prepared() -> SentenceData:
+    return prepare_sentences(small_encoder(), QUICK, *small_sentences())
+
+
+def test_a_style_that_one_word_gives_away_is_told_from_sentences_left_out():
+    found = sentences.cross_validate(small_encoder(), QUICK, prepared(), folds=4, seeds=2)
+    assert found.probability.shape == (2, 12, 3)
+    np.testing.assert_allclose(found.probability.sum(-1), 1.0, rtol=1e-5)
+    # Nine sentences for an encoder that knows no language: it errs, but is far above 1 in 3.
+    assert found.right.mean() >= 0.6
+
+
+def test_labels_without_meaning_are_told_no_better_than_by_chance():
+    # A style's wordings are the same as all others': whatever was learnt says nothing of the rest.
+    told = prepared()
+    same = told.replace(
+        hidden=jnp.broadcast_to(told.hidden[:1], told.hidden.shape),
+        mask=jnp.broadcast_to(told.mask[:1], told.mask.shape),
+    )
+    found = sentences.cross_validate(small_encoder(), QUICK, same, folds=2, seeds=1)
+    assert found.right.mean() == pytest.approx(1 / 3)
+    assert found.negative_log_likelihood > 0.9
+
+
+@pytest.mark.parametrize(
+    ("change", "message"),
+    [
+        ({"folds": 1}, "folds is 1; expected 2 to 4"),
+        ({"folds": 5}, "folds is 5; expected 2 to 4"),
+        ({"seeds": 0}, "seeds is 0; expected at least 1"),
+    ],
+)
+def test_bad_numbers_are_refused(change, message):
+    numbers = {"folds": 2, "seeds": 1} | change
+    with pytest.raises(UserError, match=message):
+        sentences.cross_validate(small_encoder(), QUICK, prepared(), **numbers)
+
+
+def test_an_unknown_environment_is_refused():
+    with pytest.raises(UserError, match="overcooked/kitchen"):
+        sentences.run(sentences.Arguments("overcooked/kitchen"))
+
+
+def test_the_packaged_sentences_are_cross_validated(capsys):
+    short = dataclasses.replace(
+        sentences.TranslatorConfig(), fine_tuning=FitConfig(learning_rate=1e-4, steps=12)
+    )
+    arguments = sentences.Arguments("assistive/jaco", folds=2, translator=short)
+    found = sentences.run(arguments)
+    assert found.right.shape == (1, 80)
+    assert found.right.mean() > 0.5  # by chance 0.125
+    sentences.print_left_out(sentences.Console(width=120), arguments, found)
+    printed = capsys.readouterr().out
+    assert f"Told right: {found.right.mean():.3f} of 80" in printed
+    assert "scratch_upper_arm" in printed
+    assert printed.count("is taken for") == (~found.right).sum()
