@@ -133,7 +133,7 @@ class BraxArguments:
     """
 
     model: Annotated[str, tyro.conf.Positional, tyro.conf.arg(metavar="RUN")]
-    """Where the partner comes from: a finished run's folder, or `pretrained:` and an environment."""
+    """Whose partner: a finished run's folder, or `pretrained:` and an environment."""
     style: Annotated[str, tyro.conf.arg(metavar="NAME")] = "scratch_upper_arm"
     """The partner's style."""
     steps: int = 1_000_000

@@ -244,6 +244,8 @@ def test_the_fingerprint_is_of_the_parameters():
 def test_an_unknown_pretrained_model_lists_those_there_are():
     with pytest.raises(UserError, match=r"unknown pretrained model .*diverse_coordination"):
         open_model("pretrained:overcooked/nowhere")
+    with pytest.raises(UserError, match="package's model is pretrained:assistive/jaco"):
+        open_model("assistive/jaco")
     with pytest.raises(ValueError, match=r"no pretrained model .*diverse_coordination.*or train"):
         pretrained.load("overcooked/nowhere")
 
