@@ -16,6 +16,7 @@ import importlib.metadata
 import importlib.util
 import json
 import os
+from collections.abc import Callable
 from pathlib import Path
 from types import ModuleType
 from typing import Annotated, Any
@@ -281,7 +282,9 @@ def _compile_without_fusion() -> None:
     os.environ["XLA_FLAGS"] = f"{flags} --xla_cpu_use_fusion_emitters=false".strip()
 
 
-def _compare_learners(arguments: BraxArguments, contest: ModuleType) -> dict[str, Any]:
+def _compare_learners(
+    arguments: BraxArguments, contest: ModuleType, tell: Callable[[str], None]
+) -> dict[str, Any]:
     """Our PPO and Brax's for one of a model's partners."""
     model = models.open_model(arguments.model)
     if not model.env.continuous:
@@ -289,7 +292,8 @@ def _compare_learners(arguments: BraxArguments, contest: ModuleType) -> dict[str
     with as_user_error():
         config = contest.learner_config(model.env.name, arguments.steps)
     style = choose("style", arguments.style, model.env.style_names)
-    learners = contest.measure_learners(model, style, config, arguments.seeds, arguments.games)
+    sizes = (arguments.seeds, arguments.games)
+    learners = contest.measure_learners(model, style, config, *sizes, tell=tell)
     return {
         "environment": model.env.name,
         "style": style,
@@ -318,7 +322,7 @@ def main() -> None:
         # Brax takes seconds to import, for which the other contests need not wait.
         from experiments import benchmark_brax
 
-        found = _compare_learners(arguments, benchmark_brax)
+        found = _compare_learners(arguments, benchmark_brax, console.print)
         console.print(benchmark_brax.brax_table(found))
     elif isinstance(arguments, LbfArguments):
         batch, steps = arguments.batch, arguments.steps

@@ -58,7 +58,13 @@ def learner_config(environment: str, steps: int) -> PPOConfig:
 
 
 def measure_learners(
-    model: TrainedModel, style: str, config: PPOConfig, seeds: int, games: int
+    model: TrainedModel,
+    style: str,
+    config: PPOConfig,
+    seeds: int,
+    games: int,
+    *,
+    tell: Callable[[str], None] = print,
 ) -> dict[str, Any]:
     """Trains egos for one frozen partner with both learners, with the same settings and steps.
 
@@ -72,6 +78,7 @@ def measure_learners(
         config: settings of each training; see `learner_config`.
         seeds: egos of each learner.
         games: games in which an ego is judged.
+        tell: is told what has been done.
 
     Returns:
         By learner: mean `returns` by seed, [seed]; `seconds` of the training of all seeds
@@ -87,16 +94,21 @@ def measure_learners(
     policies, seconds = train_ours(model.env, config, partner, style, seeds)
     egos = [jax.tree.map(lambda leaf, i=i: leaf[i], policies) for i in range(seeds)]
     returns = [judge(world, games, seed, _ours(ego)) for seed, ego in enumerate(egos)]
+    tell(f"{OURS}: {seeds} egos learnt in {seconds:.0f} s")
     found: dict[str, Any] = {OURS: {"returns": returns, "seconds": seconds}}
     for rate in (share * config.learning_rate for share in PEER_RATES):
-        trained = [train_brax(world, config, rate, seed) for seed in range(seeds)]
+        name = f"Brax, learning rate {rate:g}"
+        trained = []
+        for seed in range(seeds):
+            trained.append(train_brax(world, config, rate, seed))
+            tell(f"{name}: ego {seed + 1} of {seeds} learnt in {trained[-1][2]:.0f} s")
         ways = [
             [judge(world, games, seed, make(params, deterministic)) for deterministic in (0, 1)]
             for seed, (make, params, _) in enumerate(trained)
         ]
         taken = sum(one[2] for one in trained)
         best = np.max(ways, axis=1).tolist()
-        found[f"Brax, learning rate {rate:g}"] = {
+        found[name] = {
             "returns": best,
             "seconds": taken,
             "time_ratio": taken / seconds,

@@ -42,7 +42,11 @@ class Model:
 
 @pytest.mark.slow
 def test_both_learners_learn_what_the_style_pays_for():
-    found = benchmark_brax.measure_learners(Model(), "high", CONFIG, seeds=2, games=64)
+    told = []
+    found = benchmark_brax.measure_learners(
+        Model(), "high", CONFIG, seeds=2, games=64, tell=told.append
+    )
+    assert [line.split(": ")[0] for line in told] == [list(found)[i] for i in (0, 1, 1, 2, 2)]
     assert list(found) == ["ours", "Brax, learning rate 0.003", "Brax, learning rate 0.0009"]
     # The partner loses 0.4² in each of five steps; an ego that does nothing loses as much, and
     # one that plays as it was initialised the variance of its actions besides.
