@@ -5,6 +5,7 @@
     python -m experiments.benchmark lbf                   level-based foraging against Jumanji's
     python -m experiments.benchmark arm                   the assistive arm beside C MuJoCo
     python -m experiments.benchmark ppo                   training pairs of players
+    python -m experiments.benchmark ppo --learner recurrent    training egos with a memory
     python -m experiments.benchmark brax RUN              training one player, beside Brax's PPO
 
 Absolute figures drift with the machine's load; ratios of one run hold.
@@ -19,7 +20,7 @@ import os
 from collections.abc import Callable
 from pathlib import Path
 from types import ModuleType
-from typing import Annotated, Any
+from typing import Annotated, Any, Literal
 
 import jax
 import tyro
@@ -108,15 +109,18 @@ class ArmArguments(_ContestArguments):
 
 @dataclasses.dataclass(frozen=True)
 class PpoArguments:
-    """Measure PPO with both players learning, all styles and four seeds in one program.
+    """Measure PPO: pairs of players that both learn, or universal egos with a memory.
 
-    Settings are those of the preset `quick`; the time to compile is told apart.
+    Pairs have all styles and four seeds in one program and the settings of the preset `quick`,
+    the three kinds of universal egos those of `overnight`. The time to compile is told apart.
     """
 
     env: Annotated[str, tyro.conf.arg(metavar="NAME")] = DEFAULT_ENVIRONMENT
     """Environment with partner styles."""
+    learner: Literal["pairs", "recurrent"] = "pairs"
+    """Who learns: pairs, or General, Instructed and Adaptive Ego (LSTM)."""
     updates: int = 4
-    """Updates of every pair in one repeat (1600 steps each)."""
+    """Updates of every learner in one repeat (a pair's has 1600 steps)."""
     repeats: int = 3
     """Repeats; the fastest counts."""
     cores: int | None = None
@@ -315,7 +319,12 @@ def main() -> None:
     _prepare(arguments.cores)
     console = Console()
     if isinstance(arguments, PpoArguments):
-        found = benchmark_ppo.measure_ppo(arguments.env, arguments.updates, arguments.repeats)
+        measures = {
+            "pairs": benchmark_ppo.measure_ppo,
+            "recurrent": benchmark_ppo.measure_recurrent,
+        }
+        measure = measures[arguments.learner]
+        found = measure(arguments.env, arguments.updates, arguments.repeats)
         found["machine"] = machine()
         console.print(benchmark_ppo.ppo_table(found))
     elif isinstance(arguments, BraxArguments):

@@ -1,7 +1,8 @@
-"""The training's part of the benchmark: pairs of players that learn together, and the table."""
+"""The training part of the benchmark: pairs of players that both learn, egos with a memory."""
 
 import dataclasses
 import time
+from collections.abc import Callable
 from typing import Any
 
 import jax
@@ -10,13 +11,17 @@ from rich.table import Table
 
 import envs
 from experiments.configs import PRESETS
-from haland_jax import partners
+from experiments.methods.universal import recurrent_config
+from haland_jax import partners, recurrent_ppo
 from haland_jax.population import share_out
+from haland_jax.recurrent_egos import VARIANTS
 
 BAR = 80_000
 """Environment steps per second expected of the training on two cores."""
 BARS = {"assistive/jaco": 25_000}
 """The same where the environment itself is slower."""
+RECURRENT_BAR = 10_000
+"""The same of egos with a memory."""
 
 
 def measure_ppo(environment: str, updates: int, repeats: int, config: Any = None) -> dict[str, Any]:
@@ -37,30 +42,62 @@ def measure_ppo(environment: str, updates: int, repeats: int, config: Any = None
     styles = share_out(partners.repeat_styles(env, config.num_seeds))
     train = partners.compile_training(env, config.joint, updates)
     pairs = len(env.style_names) * config.num_seeds
+    steps = pairs * updates * config.joint.steps_per_update
+    what = f"both players learning, {pairs} pairs"
+    found = _measure(lambda state: train(state, styles), state, steps, repeats)
+    return _described(environment, what, found, BARS.get(environment, BAR))
+
+
+def measure_recurrent(
+    environment: str, updates: int, repeats: int, config: Any = None
+) -> dict[str, Any]:
+    """As `measure_ppo`, of the universal egos with a memory: all three in one program.
+
+    Their partners have learnt nothing, which changes nothing of the speed.
+
+    Args:
+        environment: name in the registry.
+        updates: updates of every ego in one repeat.
+        repeats: repeats; the fastest counts.
+        config: `RunConfig`; the preset `overnight` by default.
+    """
+    env = envs.make(environment)
+    config = PRESETS["overnight"](environment, 0) if config is None else config
+    training = recurrent_config(config, config.universal.training.total_steps)
+    count = config.partners.known_seeds
+    pairs = partners.init_pairs(env, config.partners.joint, count, jax.random.key(0))
+    others = partners.unflatten(partners.trained_players(pairs).partner.actor, len(env.style_names))
+    state = recurrent_ppo.init_recurrent(env, training, jax.random.key(1), others, 1)
+    train = recurrent_ppo.compile_recurrent(env, training, updates)
+    steps = len(VARIANTS) * updates * training.steps_per_update
+    what = f"{', '.join(VARIANTS)}, {training.num_envs} games each"
+    return _described(environment, what, _measure(train, state, steps, repeats), RECURRENT_BAR)
+
+
+def _measure(
+    train: Callable[[Any], tuple[Any, dict[str, jax.Array]]], state: Any, steps: int, repeats: int
+) -> dict[str, float]:
+    """Speed of a chunk of `steps` steps that donates its state, and seconds to compile."""
     seconds = []
     for _ in range(repeats + 1):  # the first one compiles
         begin = time.perf_counter()
-        state, metrics = jax.block_until_ready(train(state, styles))
+        state, metrics = jax.block_until_ready(train(state))
         seconds.append(time.perf_counter() - begin)
-    best = min(seconds)
     if not np.isfinite(metrics["loss"]).all():
         raise FloatingPointError("the training's loss is not finite")
-    bar = BARS.get(environment, BAR)
-    speed = pairs * updates * config.joint.steps_per_update / best
-    return {
-        "environment": environment,
-        "pairs": pairs,
-        "steps_per_second": speed,
-        "compile_seconds": seconds[0] - best,
-        "bar": bar,
-        "met": speed >= bar,
-    }
+    best = min(seconds)
+    return {"steps_per_second": steps / best, "compile_seconds": seconds[0] - best}
+
+
+def _described(environment: str, what: str, found: dict[str, float], bar: int) -> dict[str, Any]:
+    met = found["steps_per_second"] >= bar
+    return {"environment": environment, "what": what, **found, "bar": bar, "met": met}
 
 
 def ppo_table(found: dict[str, Any]) -> Table:
     """The training's speed for the terminal."""
     table = Table(
-        title=f"PPO, both players learning, {found['pairs']} pairs, {found['environment']}",
+        title=f"PPO, {found['what']}, {found['environment']}",
         caption=", ".join(f"{name} {value}" for name, value in found["machine"].items()),
     )
     for column in ("steps/s", "bar", "", "compilation"):

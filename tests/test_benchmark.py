@@ -10,6 +10,7 @@ import pytest
 import envs
 from envs.base import Pair
 from experiments import benchmark, benchmark_ppo, contenders
+from experiments.configs import PRESETS
 from haland_jax.partners import PartnersConfig
 from haland_jax.ppo import PPOConfig
 
@@ -74,10 +75,19 @@ def test_training_is_measured():
         PartnersConfig(train_seeds=1, held_out_seeds=1, spare_seeds=0), joint=tiny
     )
     found = benchmark_ppo.measure_ppo("overcooked/center_pots", 1, 1, config)
-    assert found["pairs"] == 16
+    assert found["what"] == "both players learning, 16 pairs"
     assert found["steps_per_second"] > 0
     assert found["met"] == (found["steps_per_second"] >= benchmark_ppo.BAR)
     assert benchmark_ppo.ppo_table(found | {"machine": {}}).row_count == 1
+
+
+@pytest.mark.slow
+def test_training_of_egos_with_a_memory_is_measured():
+    config = PRESETS["smoke"]("overcooked/center_pots", 0)
+    found = benchmark_ppo.measure_recurrent("overcooked/center_pots", 1, 1, config)
+    assert "Adaptive Ego, 32 games each" in found["what"]
+    assert found["steps_per_second"] > 0
+    assert found["met"] == (found["steps_per_second"] >= benchmark_ppo.RECURRENT_BAR)
 
 
 def test_arguments_are_checked():

@@ -6,6 +6,7 @@ import itertools
 import jax
 import numpy as np
 
+from experiments.configs import RunConfig
 from experiments.methods.base import Given, MakeEgo, Told, Trained
 from experiments.stages import Run
 from experiments.training import train_in_pieces
@@ -23,7 +24,7 @@ KNOWS = {
 """What each ego knows besides what it sees."""
 
 
-def training_config(run: Run, steps: int) -> PPOConfig:
+def recurrent_config(config: RunConfig, steps: int) -> PPOConfig:
     """Settings of an ego with a memory, from those of the run's feed-forward universal egos.
 
     Longer minibatches and fewer passes: on a CPU a step of a memory costs a product of matrices
@@ -33,7 +34,7 @@ def training_config(run: Run, steps: int) -> PPOConfig:
         ValueError: too few steps.
     """
     return dataclasses.replace(
-        run.config.universal.training,
+        config.universal.training,
         total_steps=steps,
         epochs=2,
         num_minibatches=4,
@@ -48,11 +49,11 @@ class RecurrentEgos:
 
     def num_updates(self, run: Run, steps: int) -> int:
         """Updates of each."""
-        return training_config(run, steps).num_updates
+        return recurrent_config(run.config, steps).num_updates
 
     def train(self, given: Given) -> Trained:
         """Trains them by PPO with the partners of all styles together, one partner a game."""
-        env, training = given.env, training_config(given.run, given.steps)
+        env, training = given.env, recurrent_config(given.run.config, given.steps)
         state, returns = train_in_pieces(
             training,
             recurrent_ppo.init_recurrent(env, training, given.key, given.partners, given.seeds),
