@@ -1,5 +1,6 @@
 """What all tests share: two host devices, a lasting compilation cache, one finished smoke run."""
 
+import collections
 import contextlib
 import os
 
@@ -37,6 +38,21 @@ def pytest_configure(config):
     jax.config.update("jax_compilation_cache_dir", os.environ["JAX_COMPILATION_CACHE_DIR"])
     # Small programs too: both workers and the commands they start compile much the same ones.
     jax.config.update("jax_persistent_cache_min_compile_time_secs", 0.0)
+
+
+def pytest_collection_modifyitems(items):
+    """Shares the files out to the workers, long ones first, so that none waits for another.
+
+    Files whose tests look at the smoke run go to one worker: a second one would wait for it.
+    """
+    smoke = {item.path for item in items if "smoke_run" in item.fixturenames}
+    group = {item.path: "smoke" if item.path in smoke else item.path.stem for item in items}
+    slow = collections.Counter(
+        group[item.path] for item in items if item.get_closest_marker("slow")
+    )
+    items.sort(key=lambda item: (-slow[group[item.path]], group[item.path]))
+    for item in items:
+        item.add_marker(pytest.mark.xdist_group(group[item.path]))
 
 
 @contextlib.contextmanager
