@@ -62,7 +62,7 @@ def test_an_unknown_environment_is_refused():
 
 def test_the_packaged_sentences_are_cross_validated(capsys):
     short = dataclasses.replace(
-        sentences.TranslatorConfig(), fine_tuning=FitConfig(learning_rate=1e-4, steps=12)
+        sentences.TranslatorConfig(), fine_tuning=FitConfig(learning_rate=1e-4, steps=24)
     )
     arguments = sentences.Arguments("assistive/jaco", folds=2, translator=short)
     found = sentences.run(arguments)
