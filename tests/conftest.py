@@ -1,6 +1,5 @@
 """What all tests share: two host devices, a lasting compilation cache, one finished smoke run."""
 
-import collections
 import contextlib
 import os
 
@@ -40,20 +39,21 @@ def pytest_configure(config):
     jax.config.update("jax_persistent_cache_min_compile_time_secs", 0.0)
 
 
-@pytest.hookimpl(tryfirst=True)  # before xdist reads the groups
 def pytest_collection_modifyitems(items):
-    """Shares the files out to the workers, long ones first, so that none waits for another.
+    """Orders the files for the workers, who take them in turn: those with slow tests first.
 
-    Files whose tests look at the smoke run go to one worker: a second one would wait for it.
+    Of the files that look at the smoke run the first one makes it; the others come after the slow
+    ones, so that nobody waits for it.
     """
+    slow = {item.path for item in items if item.get_closest_marker("slow")}
     smoke = {item.path for item in items if "smoke_run" in item.fixturenames}
-    group = {item.path: "smoke" if item.path in smoke else item.path.stem for item in items}
-    slow = collections.Counter(
-        group[item.path] for item in items if item.get_closest_marker("slow")
-    )
-    items.sort(key=lambda item: (-slow[group[item.path]], group[item.path]))
-    for item in items:
-        item.add_marker(pytest.mark.xdist_group(group[item.path]))
+
+    def turn(item) -> int:
+        if item.path in smoke:
+            return 0 if item.path == min(smoke) else 2
+        return 1 if item.path in slow else 3
+
+    items.sort(key=turn)
 
 
 @contextlib.contextmanager

@@ -30,6 +30,8 @@ from haland_jax.diffusion import (
 from haland_jax.fit import FitConfig, init_fit, make_fit_chunk
 from haland_jax.unet import UNetConfig
 
+pytestmark = pytest.mark.light_compilation
+
 TINY = DiffusionConfig(
     unet=UNetConfig(channels=16, inner_channels=32, groups=4, heads=2, step_features=16),
     token_features=8,

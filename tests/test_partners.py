@@ -13,6 +13,8 @@ from haland_jax.partners import PartnersConfig, Player
 from haland_jax.ppo import PPOConfig
 from haland_jax.seeds import meet_next_partners, select_from_circles, select_seeds, take_seeds
 
+pytestmark = pytest.mark.light_compilation
+
 TINY = PPOConfig(
     total_steps=80, num_envs=4, rollout_steps=5, num_minibatches=2, epochs=1, confined_until=0.0
 )
