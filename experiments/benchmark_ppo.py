@@ -1,6 +1,5 @@
 """The training part of the benchmark: pairs of players that both learn, egos with a memory."""
 
-import dataclasses
 import time
 from collections.abc import Callable
 from typing import Any
@@ -14,6 +13,7 @@ from experiments.configs import PRESETS
 from experiments.methods.universal import recurrent_config
 from haland_jax import partners, recurrent_ppo
 from haland_jax.population import share_out
+from haland_jax.ppo_loss import PPOConfig
 from haland_jax.recurrent_egos import VARIANTS
 
 BAR = 80_000
@@ -22,27 +22,32 @@ BARS = {"assistive/jaco": 25_000}
 """The same where the environment itself is slower."""
 RECURRENT_BAR = 10_000
 """The same of egos with a memory."""
+PAIRS_OF_A_STYLE = 4
 
 
-def measure_ppo(environment: str, updates: int, repeats: int, config: Any = None) -> dict[str, Any]:
+def measure_ppo(
+    environment: str,
+    updates: int,
+    repeats: int,
+    config: PPOConfig | None = None,
+    seeds: int = PAIRS_OF_A_STYLE,
+) -> dict[str, Any]:
     """Steps per second of training pairs, and seconds to compile.
 
     Args:
         environment: name in the registry.
         updates: updates of every pair in one repeat.
         repeats: repeats; the fastest counts.
-        config: `PartnersConfig`; four seeds a style with the settings of the preset `quick` by
-            default.
+        config: how pairs learn; as in the preset `quick` by default.
+        seeds: pairs of each style.
     """
     env = envs.make(environment)
-    if config is None:
-        quick = PRESETS["quick"](environment, 0).partners
-        config = dataclasses.replace(quick, train_seeds=3, held_out_seeds=1, spare_seeds=0)
-    state = share_out(partners.init_pairs(env, config.joint, config.num_seeds, jax.random.key(0)))
-    styles = share_out(partners.repeat_styles(env, config.num_seeds))
-    train = partners.compile_training(env, config.joint, updates)
-    pairs = len(env.style_names) * config.num_seeds
-    steps = pairs * updates * config.joint.steps_per_update
+    config = config or PRESETS["quick"](environment, 0).partners.joint
+    state = share_out(partners.init_pairs(env, config, seeds, jax.random.key(0)))
+    styles = share_out(partners.repeat_styles(env, seeds))
+    train = partners.compile_training(env, config, updates)
+    pairs = len(env.style_names) * seeds
+    steps = pairs * updates * config.steps_per_update
     what = f"both players learning, {pairs} pairs"
     found = _measure(lambda state: train(state, styles), state, steps, repeats)
     return _described(environment, what, found, BARS.get(environment, BAR))

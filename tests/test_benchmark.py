@@ -1,6 +1,5 @@
 """The benchmark's loops play what they claim to play; speeds are not tested."""
 
-import dataclasses
 
 import jax
 import jax.numpy as jnp
@@ -11,7 +10,6 @@ import envs
 from envs.base import Pair
 from experiments import benchmark, benchmark_ppo, contenders
 from experiments.configs import PRESETS
-from haland_jax.partners import PartnersConfig
 from haland_jax.ppo import PPOConfig
 
 pytestmark = pytest.mark.light_compilation
@@ -73,10 +71,7 @@ def test_kitchen_with_the_peer():
 
 def test_training_is_measured():
     tiny = PPOConfig(total_steps=320, num_envs=4, rollout_steps=10, num_minibatches=2, epochs=1)
-    config = dataclasses.replace(
-        PartnersConfig(train_seeds=1, held_out_seeds=1, spare_seeds=0), joint=tiny
-    )
-    found = benchmark_ppo.measure_ppo("overcooked/center_pots", 1, 1, config)
+    found = benchmark_ppo.measure_ppo("overcooked/center_pots", 1, 1, tiny, seeds=2)
     assert found["what"] == "both players learning, 16 pairs"
     assert found["steps_per_second"] > 0
     assert found["met"] == (found["steps_per_second"] >= benchmark_ppo.BAR)
