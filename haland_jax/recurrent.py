@@ -11,6 +11,7 @@ from typing import Any, NamedTuple
 import flax.linen as nn
 import jax
 import jax.numpy as jnp
+import numpy as np
 
 from haland_jax.networks import Distribution, DistributionKind, Gaussian
 
@@ -32,18 +33,6 @@ def no_memory(*leading: int) -> Memory:
     return Memory(jnp.zeros((*leading, UNITS)), jnp.zeros((*leading, UNITS)))
 
 
-class _Kept(NamedTuple):
-    """What the gradient needs of a step, [T, B, H] each."""
-
-    entering: jax.Array
-    forgetting: jax.Array
-    candidate: jax.Array
-    leaving: jax.Array
-    cell_before: jax.Array
-    hidden_before: jax.Array
-    cell: jax.Array
-
-
 @jax.custom_vjp
 def remember(
     kernel: jax.Array, projected: jax.Array, keep: jax.Array, start: Memory
@@ -61,61 +50,61 @@ def remember(
     Returns:
         Hidden states after each step, [T, B, H], and the memory after the last one.
     """
-    hidden, last, _ = _forwards(kernel, projected, keep, start)
-    return hidden, last
+    return _remember_forwards(kernel, projected, keep, start)[0]
 
 
-def _forwards(
+def _remember_forwards(
     kernel: jax.Array, projected: jax.Array, keep: jax.Array, start: Memory
-) -> tuple[jax.Array, Memory, _Kept]:
+) -> tuple[tuple[jax.Array, Memory], tuple[Any, ...]]:
+    """What `remember` returns, and what its gradient needs."""
+    # The logistic function is a hyperbolic tangent: one call of it makes all gates.
+    units = kernel.shape[0]
+    scale = np.repeat(np.float32([0.5, 0.5, 1.0, 0.5]), units)
+    shift = np.repeat(np.float32([0.5, 0.5, 0.0, 0.5]), units)
+
     def step(memory: Memory, now: tuple[jax.Array, jax.Array]):
-        gates, going_on = now
-        memory = Memory(*(part * going_on[:, None] for part in memory))
-        following, kept = _step(kernel, gates, memory)
-        return following, (following.hidden, kept)
+        given, going_on = now
+        cell, hidden = (part * going_on[:, None] for part in memory)
+        gates = jnp.tanh((given + hidden @ kernel) * scale) * scale + shift
+        entering, forgetting, candidate, leaving = jnp.split(gates, 4, axis=-1)
+        cell = forgetting * cell + entering * candidate
+        memory = Memory(cell, leaving * jnp.tanh(cell))
+        return memory, (gates, *memory)
 
-    last, (hidden, kept) = jax.lax.scan(step, start, (projected, keep))
-    return hidden, last, kept
-
-
-def _step(kernel: jax.Array, projected: jax.Array, memory: Memory) -> tuple[Memory, _Kept]:
-    """One step of a memory, and what its gradient needs."""
-    gates = jnp.split(projected + memory.hidden @ kernel, 4, axis=-1)
-    entering, forgetting, leaving = (jax.nn.sigmoid(gates[index]) for index in (0, 1, 3))
-    candidate = jnp.tanh(gates[2])
-    cell = forgetting * memory.cell + entering * candidate
-    kept = _Kept(entering, forgetting, candidate, leaving, memory.cell, memory.hidden, cell)
-    return Memory(cell, leaving * jnp.tanh(cell)), kept
-
-
-def _remember_forwards(kernel: Any, projected: Any, keep: Any, start: Memory) -> Any:
-    hidden, last, kept = _forwards(kernel, projected, keep, start)
-    return (hidden, last), (kernel, keep, kept)
+    last, (gates, cell, hidden) = jax.lax.scan(step, start, (projected, keep))
+    return (hidden, last), (kernel, keep, start, gates, cell, hidden)
 
 
 def _remember_backwards(saved: Any, gradients: Any) -> Any:
-    kernel, keep, kept = saved
+    kernel, keep, start, gates, cell, hidden = saved
     of_hidden, of_last = gradients
 
+    def before(first: jax.Array, after: jax.Array) -> jax.Array:
+        """A part of the memory before each step, from those after each."""
+        return jnp.concatenate([first[None], after[:-1]]) * keep[..., None]
+
     def step(carry: Memory, now: Any):
-        gradient, kept, keep = now
-        squashed = jnp.tanh(kept.cell)
-        hidden = gradient + carry.hidden
-        cell = carry.cell + hidden * kept.leaving * (1 - squashed**2)
-        gates = jnp.concatenate(
+        gradient, gates, cell, cell_before, going_on = now
+        entering, forgetting, candidate, leaving = jnp.split(gates, 4, axis=-1)
+        squashed = jnp.tanh(cell)
+        of_hidden = gradient + carry.hidden
+        of_cell = carry.cell + of_hidden * leaving * (1 - squashed**2)
+        of_gates = jnp.concatenate(
             [
-                cell * kept.candidate * kept.entering * (1 - kept.entering),
-                cell * kept.cell_before * kept.forgetting * (1 - kept.forgetting),
-                cell * kept.entering * (1 - kept.candidate**2),
-                hidden * squashed * kept.leaving * (1 - kept.leaving),
+                of_cell * candidate * entering * (1 - entering),
+                of_cell * cell_before * forgetting * (1 - forgetting),
+                of_cell * entering * (1 - candidate**2),
+                of_hidden * squashed * leaving * (1 - leaving),
             ],
             axis=-1,
         )
-        before = Memory(cell * kept.forgetting, gates @ kernel.T)
-        return Memory(*(part * keep[:, None] for part in before)), gates
+        earlier = Memory(of_cell * forgetting, of_gates @ kernel.T)
+        return Memory(*(part * going_on[:, None] for part in earlier)), of_gates
 
-    first, of_projected = jax.lax.scan(step, of_last, (of_hidden, kept, keep), reverse=True)
-    of_kernel = jnp.einsum("tbh,tbg->hg", kept.hidden_before, of_projected)
+    steps = (of_hidden, gates, cell, before(start.cell, cell), keep)
+    first, of_projected = jax.lax.scan(step, of_last, steps, reverse=True)
+    flat = before(start.hidden, hidden).reshape(-1, hidden.shape[-1])
+    of_kernel = flat.T @ of_projected.reshape(-1, of_projected.shape[-1])
     return of_kernel, of_projected, jnp.zeros_like(keep), jax.tree.map(jnp.zeros_like, first)
 
 
