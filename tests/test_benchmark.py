@@ -1,6 +1,5 @@
 """The benchmark's loops play what they claim to play; speeds are not tested."""
 
-
 import jax
 import jax.numpy as jnp
 import numpy as np

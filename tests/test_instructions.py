@@ -49,11 +49,10 @@ def write(folder: Path, text: str) -> Path:
 
 @pytest.mark.parametrize("environment", sorted(STYLES))
 def test_every_style_has_as_many_training_and_test_sentences(environment):
-    training = 20 if environment == "assistive/jaco" else 10
     instructions = load_instructions(environment, STYLES[environment])
     assert tuple(instructions) == STYLES[environment]
     for style, sentences in instructions.items():
-        assert len(sentences.train) == training, style
+        assert len(sentences.train) == 20, style
         assert len(sentences.test) == 4, style
 
 
