@@ -23,6 +23,10 @@ class Estimate(NamedTuple):
     low: float
     high: float
 
+    def __str__(self) -> str:
+        """For a reader: 0.98 [0.96, 0.99]."""
+        return f"{self.value:.2f} [{self.low:.2f}, {self.high:.2f}]"
+
     def overlaps(self, other: "Estimate") -> bool:
         """Whether the two intervals have a point in common."""
         return self.low <= other.high and other.low <= self.high

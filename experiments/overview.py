@@ -6,6 +6,8 @@ from typing import Any
 
 import numpy as np
 
+from experiments.intervals import Estimate
+from experiments.standing import Standing, best_ego, standings
 from experiments.summary import (
     BEST_RESPONSE,
     HEADLINE,
@@ -57,6 +59,9 @@ class Overview:
         gates: how many there are.
         machine: processor and number of its cores.
         date: day of the run, year-month-day.
+        shares: by method that is compared with others, the interquartile mean of return / Oracle
+            with its interval; Haland's first.
+        best_ego: the universal ego that earns most beside Haland; None where none was measured.
     """
 
     environment: str
@@ -85,6 +90,8 @@ class Overview:
     gates: int
     machine: str | None
     date: str | None
+    shares: Mapping[str, Estimate]
+    best_ego: Standing | None
 
     def amount(self, value: float | None) -> str:
         """A return of this environment for a reader; a dash for what was not measured."""
@@ -143,6 +150,8 @@ def overview(results: Mapping[str, Any]) -> Overview:
         gates=len(gates),
         machine=_machine(machine),
         date=machine.get("date"),
+        shares=_shares(results),
+        best_ego=best_ego(results),
     )
 
 
@@ -154,6 +163,12 @@ def number(value: float | None, digits: int = 0) -> str:
 def percent(value: float | None) -> str:
     """The share in per cent; a dash for what was not measured."""
     return "–" if value is None else f"{value:.0%}"
+
+
+def _shares(results: Mapping[str, Any]) -> dict[str, Estimate]:
+    found = standings(results)
+    haland = {HEADLINE: found[0].haland} if found else {}
+    return haland | {one.method: one.share for one in found}
 
 
 def _share(results: Mapping[str, Any], method: str) -> float | None:

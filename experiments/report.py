@@ -9,6 +9,7 @@ from rich.table import Table
 
 from experiments.figures import draw_figures
 from experiments.markdown import table as _table
+from experiments.standing import standings
 from experiments.summary import (
     COMPARISONS,
     HEADLINE,
@@ -84,6 +85,7 @@ def write_report(results: Mapping[str, Any], folder: str | Path) -> Path:
         _gates(results),
         _by_style(results),
         _worth(results, figures),
+        _standings(results),
         _translator(results),
         _memorisation(results),
         _figures(figures),
@@ -164,7 +166,9 @@ def _headline(results: Mapping[str, Any]) -> str:
     table = _table(head, rows, "l" + "r" * (len(head) - 2) + "l")
     note = (
         "Mean ± sample standard deviation over the held-out seeds, of each seed's mean over "
-        "styles. The ratio divides each partner's return by that partner's own Oracle."
+        "styles. The ratio divides each partner's return by that partner's own Oracle. *IQM*: the "
+        "interquartile mean of those ratios over styles and held-out seeds, with its stratified "
+        "bootstrap interval (Agarwal et al., 2021)."
     )
     if dead := dead_partners(results):
         note += (
@@ -225,6 +229,24 @@ def _worth(results: Mapping[str, Any], figures: Iterable[Path]) -> str:
     shown = [_shown(file) for file in figures if file.stem == _WORTH_FIGURE]
     parts = list(filter(None, [worth_of_the_style(results), *shown, _sights(results)]))
     return "\n\n".join(["## What the style is worth", *parts]) if parts else ""
+
+
+def _standings(results: Mapping[str, Any]) -> str:
+    """Haland beside the methods that were compared with it."""
+    found = standings(results)
+    if "compared" not in results or not found:
+        return ""
+    rows = [(HEADLINE, str(found[0].haland), "", "", "")]
+    for one in found:
+        steps = "–" if one.steps is None else steps_in_words(one.steps)
+        budget = "–" if one.budget is None else f"{one.budget:.0%}"
+        rows.append((one.method, str(one.share), f"**{one.verdict}**", steps, budget))
+    head = ("method", "return / Oracle, IQM (95%)", "Haland is", "steps", "of all best responses'")
+    return (
+        f"## Beside other methods\n\n{_table(head, rows, 'lrlrr')}\n\n"
+        "With the same held-out partners. *Level*: the intervals overlap. *Steps*: environment "
+        "steps of each ego, and as a share of those of all best responses together."
+    )
 
 
 def _sights(results: Mapping[str, Any]) -> str:
@@ -305,7 +327,7 @@ def _costs(results: Mapping[str, Any]) -> str:
 def _columns(rows: Sequence[MethodSummary], ratio: str) -> tuple[str, ...]:
     """Heads of what `_numbers` gives."""
     success = ("success",) if any(row.success is not None for row in rows) else ()
-    return ("return", ratio, *success, "episodes")
+    return ("return", ratio, "IQM (95%)", *success, "episodes")
 
 
 def _numbers(row: MethodSummary, rows: Sequence[MethodSummary]) -> tuple[str, ...]:
@@ -314,7 +336,8 @@ def _numbers(row: MethodSummary, rows: Sequence[MethodSummary]) -> tuple[str, ..
     ratio = "–" if np.isnan(row.ratio) else f"{row.ratio:.3f} ± {row.ratio_std:.3f}"
     success = ("–",) if row.success is None else (f"{row.success:.0%}",)
     success = success if any(other.success is not None for other in rows) else ()
-    return _with_spread(row.mean, row.std), ratio, *success, count
+    interval = "–" if row.interval is None or row.method == ORACLE else str(row.interval)
+    return _with_spread(row.mean, row.std), ratio, interval, *success, count
 
 
 def _with_spread(centre: float, deviation: float) -> str:

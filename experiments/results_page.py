@@ -6,6 +6,8 @@ import envs
 from experiments.markdown import table
 from experiments.overview import Overview, number, percent
 from experiments.run_all import ALL
+from experiments.standing import Standing
+from experiments.worth import steps_in_words
 
 AIM = 0.95
 _Column = tuple[str, Callable[[Overview], str], str]
@@ -134,6 +136,7 @@ def page(overviews: Sequence[Overview], remarks: str) -> str:
         "partner's style. Where the *universal ego* comes near *own style*, it can see the style "
         "for itself, and a sentence has little to add; where being *told* helps it, it cannot.",
         _sights(overviews),
+        beside_others(overviews),
         "## How it was measured\n\n" + _table(overviews, _HOW),
         "To make the same runs, and this page from them:\n\n```bash\n"
         + "\n".join(_commands(overviews))
@@ -183,6 +186,39 @@ def _sights(overviews: Sequence[Overview]) -> str:
         "partner ends at that many rows and columns (`partner_sight` of `envs.make`), and the "
         "universal egos are trained anew (`python -m experiments.sight RUN`).\n\n"
         + table(head, rows, "llrrr")
+    )
+
+
+def beside_others(overviews: Sequence[Overview]) -> str:
+    """Haland and all other methods by environment; empty where nothing was compared."""
+    found = [row for row in overviews if row.shares]
+    if not found:
+        return ""
+    methods = list(dict.fromkeys(name for row in found for name in row.shares))
+    rows = [
+        (method, *(str(row.shares[method]) if method in row.shares else "–" for row in found))
+        for method in methods
+    ]
+    head = ("method", *(row.environment for row in found))
+    said = [f"- **{row.environment}**: {_beside(row.best_ego)}" for row in found if row.best_ego]
+    return (
+        "## Beside other methods\n\nReturn / Oracle with held-out partners: interquartile mean "
+        "over styles and held-out seeds, with its stratified bootstrap interval (95%).\n\n"
+        + table(head, rows, "l" + "r" * len(found))
+        + "\n\n"
+        + "\n".join(said)
+    )
+
+
+def _beside(best: Standing) -> str:
+    """Haland beside the best universal ego, in a sentence."""
+    where = {"ahead": "ahead of", "behind": "behind", "level": "level with"}[best.verdict]
+    overlap = ", and the intervals overlap" if best.verdict == "level" else ""
+    budget = "" if best.budget is None else f", {best.budget:.0%} of those of all best responses"
+    steps = "" if best.steps is None else f" ({steps_in_words(best.steps)} steps{budget})"
+    return (
+        f"Haland ({best.haland}) is {where} the best universal ego, {best.method}{steps}: "
+        f"{best.share}{overlap}."
     )
 
 

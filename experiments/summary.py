@@ -12,6 +12,7 @@ from typing import Any
 import numpy as np
 
 from experiments.errors import UserError
+from experiments.intervals import Estimate, estimate
 
 ORACLE = "Oracle"
 BEST_RESPONSE = "Best response"
@@ -39,7 +40,9 @@ PARTNER_SIGHT = "partner_sight"
 class MethodSummary:
     """One row of the headline table; the ratio is the return divided by that partner's Oracle.
 
-    `success` is the share of games that succeeded, None where games only earn a return.
+    `interval` is the interquartile mean of the ratios over styles and held-out seeds, with its
+    stratified bootstrap interval; None where there is no ratio. `success` is the share of games
+    that succeeded, None where games only earn a return.
     """
 
     method: str
@@ -47,6 +50,7 @@ class MethodSummary:
     std: float
     ratio: float
     ratio_std: float
+    interval: Estimate | None
     success: float | None
     episodes: int | None
 
@@ -161,6 +165,7 @@ def summarise(results: Mapping[str, Any]) -> list[MethodSummary]:
                 std=spread(by_seed),
                 ratio=mean(ratio),
                 ratio_std=spread(ratio_by_seed),
+                interval=estimate(ratio) if np.isfinite(ratio).any() else None,
                 success=success(results, method),
                 episodes=episodes(results, method),
             )

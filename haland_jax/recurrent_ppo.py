@@ -2,9 +2,9 @@
 
 One ego learns with the frozen partners of all styles together. The General Ego only sees the
 game; the Instructed Ego is told the partner's style, the Adaptive Ego what the partner did last.
-All three learn in one program, members [variant, seed]: what an ego is not told is zero. A
-minibatch is a share of the games, each as the sequence of a whole rollout, which starts from
-the memory that the ego then had.
+All three learn in one program, members [variant, seed]: what an ego is not told is zero. They
+learn from pieces of `SEQUENCE` steps, each of which starts from the memory that the ego had there
+(as the data chunks of Yu et al., 2022: MAPPO); a minibatch is a share of the games.
 """
 
 from collections.abc import Callable
@@ -33,6 +33,9 @@ from haland_jax.recurrent_egos import (
     tells_of,
 )
 from haland_jax.rollout import shown_action
+
+SEQUENCE = 10
+"""Steps through which gradients flow; a rollout of fewer is one piece."""
 
 
 class RecurrentLearner(PyTreeNode):
@@ -88,9 +91,14 @@ def init_recurrent(
         Training states with leading axis [variant * seed].
 
     Raises:
-        ValueError: the partners cannot share the games in equal parts, or the ego would be held
-            to a role.
+        ValueError: the partners cannot share the games in equal parts, a rollout is no number of
+            whole sequences, or the ego would be held to a role.
     """
+    if config.rollout_steps % _sequence(config):
+        raise ValueError(
+            f"rollout_steps is {config.rollout_steps}; expected a multiple of {SEQUENCE}, the "
+            "steps that an ego with a memory learns from at a time"
+        )
     if config.confined_until > 0.0:
         raise ValueError(
             f"confined_until is {config.confined_until}; expected 0, since an ego for all styles "
@@ -173,13 +181,13 @@ def _update(
     """One rollout and the learning from it."""
     progress = state.update / config.num_updates
     _, critic = networks_of(env)
-    memories = state.memories
+    memory = state.memories[1]
     state, steps = _rollout(env, config, state, ppo.random_share(config, progress))
 
     ego = state.ego
     played = normalisation.normalise(ego.normaliser, steps["observations"].ego)
     sequence = (played, steps["told"], steps["began"])
-    values, critic_memory = critic.apply(ego.critic, *sequence, memories[1])
+    values, critic_memory, critic_memories = _values(config, critic, ego.critic, sequence, memory)
     next_seen = normalisation.normalise(ego.normaliser, state.observations.ego)
     following = (next_seen, _told(env, state), state.began)
     last, _ = critic.apply(ego.critic, *(part[None] for part in following), critic_memory)
@@ -188,7 +196,7 @@ def _update(
         rewards, values, last[0], steps["ended"], config.discount, config.gae_lambda
     )
     batch = Batch(
-        observation=(sequence, memories),
+        observation=(sequence, (steps["memory"], critic_memories)),
         action=steps["actions"].ego,
         log_prob=steps["log_prob"],
         value=values,
@@ -210,6 +218,29 @@ def _update(
         update=state.update + 1, ego=learner, memories=(state.memories[0], critic_memory)
     )
     return state, ppo.metrics_of(env, steps, losses)
+
+
+def _sequence(config: PPOConfig) -> int:
+    return min(SEQUENCE, config.rollout_steps)
+
+
+def _pieces(config: PPOConfig, leaf: jax.Array) -> jax.Array:
+    """A rollout [T, B, ...] in sequences, [piece, S, B, ...]."""
+    return leaf.reshape(-1, _sequence(config), *leaf.shape[1:])
+
+
+def _values(
+    config: PPOConfig, critic: recurrent.RecurrentCritic, params: Any, sequence: Any, memory: Memory
+) -> tuple[jax.Array, Memory, Memory]:
+    """Values of a rollout [T, B], the memory after it, and those before each piece."""
+
+    def one(memory: Memory, piece: Any) -> tuple[Any, Any]:
+        values, following = critic.apply(params, *piece, memory)
+        return following, (values, memory)
+
+    pieces = jax.tree.map(partial(_pieces, config), sequence)
+    last, (values, before) = jax.lax.scan(one, memory, pieces)
+    return values.reshape(-1, values.shape[-1]), last, before
 
 
 def _told(env: Environment, state: RecurrentState) -> jax.Array:
@@ -254,6 +285,7 @@ def _rollout(
             "told": told,
             "began": state.began,
             "actions": actions,
+            "memory": state.memories[0],
             "log_prob": networks.log_prob(acting, actions.ego),
             "reward": timesteps.reward,
             "shaped": timesteps.shaped_reward,
@@ -271,7 +303,9 @@ def _rollout(
         return state, kept
 
     key = jax.random.fold_in(state.key, state.update)
-    return jax.lax.scan(one_step, state, jax.random.split(key, config.rollout_steps))
+    state, steps = jax.lax.scan(one_step, state, jax.random.split(key, config.rollout_steps))
+    before = jax.tree.map(lambda leaf: leaf[:: _sequence(config)], steps["memory"])
+    return state, {**steps, "memory": before}
 
 
 def _learn(
@@ -288,14 +322,17 @@ def _learn(
     minibatches = config.num_minibatches
     sequence, memories = batch.observation
 
-    def dealt(leaf: jax.Array, axis: int) -> jax.Array:
-        """Every n-th game along an axis, [minibatch, ...]."""
-        shape = (*leaf.shape[:axis], -1, minibatches, *leaf.shape[axis + 1 :])
-        return jnp.moveaxis(leaf.reshape(shape), axis + 1, 0)
+    def dealt(leaf: jax.Array) -> jax.Array:
+        """From [piece, S, B, ...] every n-th game, [minibatch, S, piece * B / n, ...]."""
+        pieces, steps, games, *rest = leaf.shape
+        leaf = leaf.reshape(pieces, steps, games // minibatches, minibatches, *rest)
+        leaf = jnp.moveaxis(leaf, (3, 1, 0, 2), (0, 1, 2, 3))
+        return leaf.reshape(minibatches, steps, -1, *rest)
 
+    in_pieces = jax.tree.map(partial(_pieces, config), (sequence, batch.replace(observation=None)))
     parts = (
-        jax.tree.map(lambda leaf: dealt(leaf, 1), (sequence, batch.replace(observation=None))),
-        jax.tree.map(lambda leaf: dealt(leaf, 0), memories),
+        jax.tree.map(dealt, in_pieces),
+        jax.tree.map(lambda leaf: dealt(leaf[:, None])[:, 0], memories),
     )
 
     def loss_of(params: Any, index: jax.Array) -> jax.Array:

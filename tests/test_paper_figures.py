@@ -7,7 +7,7 @@ import pytest
 from made_up_results import STYLES, made_up_results
 from refused_command import refused
 
-from experiments import intervals, summary
+from experiments import intervals, standing, summary
 from experiments.figures import __main__ as command
 from experiments.figures import paper
 
@@ -20,7 +20,7 @@ def two_runs() -> list[dict]:
 
 def test_figure_3_compares_what_is_comparable():
     runs = two_runs()
-    assert paper.compared(runs) == [
+    assert standing.compared(runs) == [
         summary.HEADLINE, "General Ego", *summary.COMPARISONS, "My method"
     ]  # fmt: skip
     axes = paper.normalised_returns(runs).axes[0]
@@ -39,17 +39,19 @@ def test_runs_with_different_numbers_of_seeds_are_joined():
         for style in STYLES:
             by_style[style]["returns"] = by_style[style]["returns"][:1]
     other["oracle"] = {style: seeds[:1] for style, seeds in other["oracle"].items()}
-    found = paper.estimates([one, other], summary.HEADLINE)
+    found = standing.estimates([one, other], summary.HEADLINE)
     both = [summary.ratios(run, summary.HEADLINE).ravel() for run in (one, other)]
     assert found is not None
     assert found.value == pytest.approx(float(intervals.interquartile_mean(np.concatenate(both))))
-    assert paper.estimates([one, other], "General Ego") is None
+    assert standing.estimates([one, other], "General Ego") is None
 
 
 def test_figure_4_has_a_row_for_every_seed_of_the_adaptive_ego():
     results = made_up_results()
     played = np.arange(8 * 6, dtype=float).reshape(8, 6)  # seeds 0, 1, 2, 0, 1, 2
-    results["compared"] = {"universal": {"seeds": 3, "by_ego": {paper.ADAPTIVE: played.tolist()}}}
+    results["compared"] = {
+        "universal": {"seeds": 3, "by_ego": {standing.ADAPTIVE: played.tolist()}}
+    }
     axes = paper.adaptive_egos(results).axes[0]
     shown = np.array([float(text.get_text()) for text in axes.texts]).reshape(4, 8)
     oracle = [np.mean(results["oracle"][style]) for style in STYLES]
@@ -79,12 +81,12 @@ def test_the_improvement_by_hand():
         methods = {summary.HEADLINE: {"s": {"returns": [ours]}}}
         methods |= {
             name: {"s": {"returns": [value]}}
-            for name, value in zip(paper.EGOS, theirs, strict=False)
+            for name, value in zip(standing.EGOS, theirs, strict=False)
         }
         return {"styles": ["s"], "oracle": {"s": [10.0]}, "methods": methods}
 
     # Beside the best: 10 / 5 - 1 = 1 and 9 / 9 - 1 = 0; beside each: 1, 4, 0, 2.
-    found = paper.improvement([run(10.0, 5.0, 2.0), run(9.0, 9.0, 3.0), run(1.0)])
+    found = standing.improvement([run(10.0, 5.0, 2.0), run(9.0, 9.0, 3.0), run(1.0)])
     assert found == pytest.approx({"best": 0.5, "each": 1.75})
 
 

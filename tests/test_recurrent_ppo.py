@@ -94,7 +94,10 @@ def test_a_rollout_knows_styles_beginnings_and_what_partners_did():
 
 
 def test_learning_starts_from_what_was_played(monkeypatch):
-    """Before the first change, the sequences give the probabilities that the rollout had."""
+    """Before the first change, the sequences give the probabilities that the rollout had.
+
+    Two sequences of a rollout, with games that begin within both.
+    """
     seen = []
 
     def watched(distribution, value, batch, *_):
@@ -106,7 +109,10 @@ def test_learning_starts_from_what_was_played(monkeypatch):
 
     monkeypatch.setattr(recurrent_ppo, "clipped_loss", watched)
     game = ToyGame()
-    config = dataclasses.replace(TINY, normalise=True)
+    rollout = 2 * recurrent_ppo.SEQUENCE
+    config = dataclasses.replace(
+        TINY, normalise=True, rollout_steps=rollout, total_steps=4 * 8 * rollout
+    )
     state = jax.tree.map(lambda leaf: leaf[2], begin(game, config))
     noise = iter(jax.random.split(jax.random.key(5), 100))
     actor, critic = jax.tree.map(
@@ -127,12 +133,14 @@ def test_learning_starts_from_what_was_played(monkeypatch):
         assert np.std(valued) > 0.01
 
 
-def test_partners_that_cannot_share_the_games_are_refused():
+def test_settings_that_do_not_fit_are_refused():
     config = dataclasses.replace(TINY, num_envs=9, num_minibatches=3)
     with pytest.raises(ValueError, match="is 9; expected a multiple of 2, the number of partners"):
         begin(ToyGame(), config)
     with pytest.raises(ValueError, match=r"confined_until is 0\.5; expected 0"):
         begin(ToyGame(), dataclasses.replace(TINY, confined_until=0.5))
+    with pytest.raises(ValueError, match="rollout_steps is 12; expected a multiple of 10"):
+        begin(ToyGame(), dataclasses.replace(TINY, rollout_steps=12))
 
 
 def test_egos_use_what_they_remember_and_what_they_are_told():

@@ -20,6 +20,7 @@ from rich.table import Table
 
 from experiments.errors import UserError, main_guard
 from experiments.figures import paper
+from experiments.standing import improvement
 
 MISSING = {
     **dict.fromkeys(("figure_5", "figure_12"), "make the run again with this version"),
@@ -61,7 +62,7 @@ def main() -> None:
         hint = f"[yellow]missing; first: {missing}[/]" if missing else "[yellow]missing[/]"
         table.add_row(name.replace("_", " "), paper.FIGURES[name].title, shown or hint)
     console.print(table)
-    more = paper.improvement(runs)
+    more = improvement(runs)
     if more["best"] == more["best"]:
         console.print(
             f"Haland earns {more['best']:+.1%} beside the best universal ego of each environment, "

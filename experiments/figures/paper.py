@@ -1,8 +1,8 @@
 """The paper's figures and Table 1 from the results of several runs."""
 
-from collections.abc import Callable, Iterable, Mapping, Sequence
+from collections.abc import Callable, Sequence
 from pathlib import Path
-from typing import Any, NamedTuple
+from typing import NamedTuple
 
 import matplotlib
 import numpy as np
@@ -20,33 +20,11 @@ from experiments.figures.style import (
     save,
     words,
 )
-from experiments.intervals import Estimate, estimate
 from experiments.markdown import table
-from experiments.summary import (
-    COMPARISONS,
-    HEADLINE,
-    ORACLE,
-    WRONG,
-    mean,
-    ordered_methods,
-    ratios,
-    returns,
-    shares,
-    spread,
-)
+from experiments.standing import ABLATIONS, ADAPTIVE, Results, compared, estimates
+from experiments.summary import HEADLINE, ORACLE, mean, ratios, returns, shares, spread
 
-ADAPTIVE = "Adaptive Ego"
-EGOS = ("General Ego", "Instructed Ego", ADAPTIVE, "Self-play", "FCP", *COMPARISONS)
-"""Universal egos; further methods that no run of ours knows follow them."""
-ABLATIONS = ("CGAN (MLP)", "CGAN (UNet)", "Without translator", "Without VAE")
-"""The columns of Table 1 after Oracle and Haland."""
 TRAINING = "Haland, training sentences"
-NOT_COMPARED = (
-    *("Best response", "VAE reconstruction", "Diffusion, true task language", TRAINING, WRONG),
-    "Without fine-tuning",
-)
-"""Steps of Haland itself and controls, which have figures of their own."""
-Results = Mapping[str, Any]
 _MARKERS = "osD^vPX*<>"
 """Of styles, so that they can be told apart in grey."""
 
@@ -65,28 +43,6 @@ class Drawing(NamedTuple):
     runs: Callable[[Results], bool]
     draw: Callable[..., Figure]
     together: bool = False
-
-
-def compared(runs: Iterable[Results]) -> list[str]:
-    """The methods of Fig. 3: Haland, the universal egos, then any others that are not ours."""
-    found = dict.fromkeys(name for run in runs for name in ordered_methods(run))
-    left_out = (ORACLE, HEADLINE, *NOT_COMPARED, *ABLATIONS)
-    egos = [name for name in EGOS if name in found]
-    others = [name for name in found if name not in (*left_out, *EGOS)]
-    return [HEADLINE, *egos, *others]
-
-
-def estimates(runs: Sequence[Results], method: str) -> Estimate | None:
-    """The interquartile mean of a method's share of the Oracle over runs, styles and seeds.
-
-    None where a run lacks the method, or no partner's Oracle earns anything.
-    """
-    if any(method not in run["methods"] for run in runs):
-        return None
-    rows = [row for run in runs for row in ratios(run, method)]
-    widest = max(len(row) for row in rows)
-    padded = [np.pad(row, (0, widest - len(row)), constant_values=np.nan) for row in rows]
-    return estimate(np.array(padded)) if np.isfinite(padded).any() else None
 
 
 def normalised_returns(runs: Sequence[Results]) -> Figure:
@@ -223,24 +179,6 @@ def table_1(results: Results) -> str:
     share = (f"{mean(ratios(results, method)):.2f}" for method in methods)
     rows.append(("**return / Oracle**", *share))
     return table(("partner", *methods), rows, "l" + "r" * len(methods))
-
-
-def improvement(runs: Sequence[Results]) -> dict[str, float]:
-    """How much more Haland earns than others, on average over environments, as a share.
-
-    `best`: than the best universal ego of each environment; `each`: than each of them. The paper
-    states one number, 89.64%, and not how it was taken.
-    """
-    best, each = [], []
-    for run in runs:
-        others = [name for name in EGOS if name in run["methods"]]
-        if not others:
-            continue
-        ours = returns(run, HEADLINE).mean()
-        theirs = np.array([returns(run, name).mean() for name in others])
-        best.append(ours / theirs.max() - 1 if theirs.max() > 0 else np.nan)
-        each += [ours / one - 1 if one > 0 else np.nan for one in theirs]
-    return {"best": mean(np.array(best)), "each": mean(np.array(each))}
 
 
 def _short(results: Results) -> str:

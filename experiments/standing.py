@@ -1,0 +1,124 @@
+"""Haland beside other methods: shares of the Oracle with intervals, and who is ahead of whom."""
+
+from collections.abc import Iterable, Mapping, Sequence
+from typing import Any, NamedTuple
+
+import numpy as np
+
+from experiments.intervals import Estimate, estimate
+from experiments.summary import (
+    COMPARISONS,
+    HEADLINE,
+    METHODS,
+    ORACLE,
+    mean,
+    ordered_methods,
+    ratios,
+    returns,
+)
+
+ADAPTIVE = "Adaptive Ego"
+EGOS = ("General Ego", "Instructed Ego", ADAPTIVE, "Self-play", "FCP", *COMPARISONS)
+"""Universal egos; further methods that no run of ours knows follow them."""
+ABLATIONS = ("CGAN (MLP)", "CGAN (UNet)", "Without translator", "Without VAE")
+"""The columns of Table 1 after Oracle and Haland."""
+_OWN = (*(name for name in METHODS if name != HEADLINE), "Without fine-tuning")
+"""Steps of Haland itself and controls."""
+Results = Mapping[str, Any]
+
+
+class Standing(NamedTuple):
+    """Another method beside Haland, in one run.
+
+    Attributes:
+        method: its name.
+        share: interquartile mean of return / Oracle, with its 95% interval.
+        haland: the same of Haland from test sentences.
+        steps: environment steps of one of its egos; None where it learns from best responses.
+        budget: those steps as a share of the steps of all best responses together.
+    """
+
+    method: str
+    share: Estimate
+    haland: Estimate
+    steps: int | None
+    budget: float | None
+
+    @property
+    def verdict(self) -> str:
+        """Where Haland is: "ahead", "behind", or "level" where the intervals overlap."""
+        if self.haland.overlaps(self.share):
+            return "level"
+        return "ahead" if self.haland.value > self.share.value else "behind"
+
+
+def compared(runs: Iterable[Results]) -> list[str]:
+    """The methods of Fig. 3: Haland, the universal egos, then any others that are not ours."""
+    found = dict.fromkeys(name for run in runs for name in ordered_methods(run))
+    egos = [name for name in EGOS if name in found]
+    others = [name for name in found if name not in (HEADLINE, *_OWN, *ABLATIONS, *EGOS)]
+    return [HEADLINE, *egos, *others]
+
+
+def estimates(runs: Sequence[Results], method: str) -> Estimate | None:
+    """The interquartile mean of a method's share of the Oracle over runs, styles and seeds.
+
+    None where a run lacks the method, or no partner's Oracle earns anything.
+    """
+    if any(method not in run["methods"] and method != ORACLE for run in runs):
+        return None
+    rows = [row for run in runs for row in ratios(run, method)]
+    widest = max(len(row) for row in rows)
+    padded = [np.pad(row, (0, widest - len(row)), constant_values=np.nan) for row in rows]
+    return estimate(np.array(padded)) if np.isfinite(padded).any() else None
+
+
+def standings(results: Results) -> list[Standing]:
+    """The other methods of a run, universal egos first; empty where Haland was not measured."""
+    haland = estimates([results], HEADLINE)
+    if haland is None:
+        return []
+    steps = _steps(results)
+    budget = results.get("universal", {}).get("best_response_steps")
+    found = []
+    for method in [*compared([results])[1:], *ABLATIONS]:
+        share = estimates([results], method)
+        if share is None:
+            continue
+        took = steps.get(method)
+        found.append(
+            Standing(method, share, haland, took, took / budget if took and budget else None)
+        )
+    return found
+
+
+def best_ego(results: Results) -> Standing | None:
+    """The universal ego that earns most; None where none was measured."""
+    egos = [one for one in standings(results) if one.method in EGOS]
+    return max(egos, key=lambda one: one.share.value, default=None)
+
+
+def improvement(runs: Sequence[Results]) -> dict[str, float]:
+    """How much more Haland earns than others, on average over environments, as a share.
+
+    `best`: than the best universal ego of each environment; `each`: than each of them. The paper
+    states one number, 89.64%, and not how it was taken.
+    """
+    best, each = [], []
+    for run in runs:
+        others = [name for name in EGOS if name in run["methods"]]
+        if not others:
+            continue
+        ours = returns(run, HEADLINE).mean()
+        theirs = np.array([returns(run, name).mean() for name in others])
+        best.append(ours / theirs.max() - 1 if theirs.max() > 0 else np.nan)
+        each += [ours / one - 1 if one > 0 else np.nan for one in theirs]
+    return {"best": mean(np.array(best)), "each": mean(np.array(each))}
+
+
+def _steps(results: Results) -> dict[str, int]:
+    """Environment steps of each method's egos, by the name that it shows."""
+    took = dict.fromkeys(COMPARISONS, results.get("universal", {}).get("steps"))
+    for found in results.get("compared", {}).values():
+        took |= dict.fromkeys(found.get("by_ego", {}), found.get("steps"))
+    return {name: int(steps) for name, steps in took.items() if steps}

@@ -1,0 +1,76 @@
+"""Haland beside other methods: verdicts and budgets by hand."""
+
+import numpy as np
+import pytest
+from made_up_results import made_up_results
+
+from experiments import report, results_page, standing
+from experiments.intervals import Estimate
+from experiments.overview import overview
+from experiments.summary import HEADLINE, UNIVERSAL
+
+
+def measured(**shares: float) -> dict:
+    """Two styles, three held-out seeds, Oracles of 10; every partner pays the method's share."""
+    styles = ["one", "two"]
+    methods = {
+        name.replace("_", " "): {style: {"returns": [10 * share] * 3} for style in styles}
+        for name, share in shares.items()
+    }
+    return {"styles": styles, "oracle": {style: [10.0] * 3 for style in styles}, "methods": methods}
+
+
+def test_intervals_decide_who_is_ahead():
+    def verdict(low: float, high: float) -> str:
+        value = Estimate((low + high) / 2, low, high)
+        return standing.Standing("other", value, Estimate(0.9, 0.85, 0.95), None, None).verdict
+
+    assert verdict(0.70, 0.84) == "ahead"
+    assert verdict(0.70, 0.85) == "level"
+    assert verdict(0.95, 0.99) == "level"
+    assert verdict(0.96, 0.99) == "behind"
+
+
+def test_steps_are_held_against_those_of_all_best_responses():
+    results = measured(General_Ego=0.5, Universal_ego=0.9, My_method=0.2, Without_VAE=0.1)
+    results["methods"][HEADLINE] = results["methods"]["General Ego"]
+    results["universal"] = {"steps": 10, "best_response_steps": 40}
+    results["compared"] = {"universal": {"by_ego": {"General Ego": []}, "steps": 20}}
+    found = {one.method: one for one in standing.standings(results)}
+    assert list(found) == ["General Ego", UNIVERSAL, "My method", "Without VAE"]
+    assert (found["General Ego"].steps, found["General Ego"].budget) == (20, 0.5)
+    assert (found[UNIVERSAL].steps, found[UNIVERSAL].budget) == (10, 0.25)
+    assert (found["Without VAE"].steps, found["Without VAE"].budget) == (None, None)
+    assert found["Without VAE"].share == pytest.approx((0.1, 0.1, 0.1))
+    assert found["Without VAE"].verdict == "ahead"
+    best = standing.best_ego(results)
+    assert best is not None
+    assert best.method == UNIVERSAL, "ablations and others are no universal egos"
+    assert best.verdict == "behind"
+
+
+def test_nothing_to_compare():
+    assert standing.standings(measured(General_Ego=0.5)) == []
+    alone = measured()
+    alone["methods"][HEADLINE] = {style: {"returns": [9.0]} for style in alone["styles"]}
+    alone["oracle"] = {style: [10.0] for style in alone["styles"]}
+    assert standing.standings(alone) == []
+    assert standing.best_ego(alone) is None
+
+
+def test_report_and_page_name_the_best_universal_ego(tmp_path):
+    results = made_up_results(others=("General Ego", "Without VAE"))
+    results["universal"] = {"steps": 10_000_000, "best_response_steps": 40_000_000}
+    assert "## Beside other methods" not in report.write_report(results, tmp_path).read_text()
+    results["compared"] = {"universal": {"by_ego": {"General Ego": []}, "steps": 20_000_000}}
+    text = report.write_report(results, tmp_path).read_text()
+    section = text.split("## Beside other methods")[1].split("\n## ")[0]
+    assert "| General Ego |" in section
+    assert "| 20 M | 50% |" in section
+    row = overview(results)
+    assert next(iter(row.shares)) == HEADLINE
+    page = results_page.page([row], "")
+    assert f"Haland ({row.shares[HEADLINE]})" in page
+    assert "is ahead of the best universal ego, Universal ego with the style's label" in page
+    assert "(10 M steps, 25% of those of all best responses)" in page
+    assert np.isclose(row.shares[HEADLINE].value, 0.92, atol=0.03)
