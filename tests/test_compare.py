@@ -14,6 +14,8 @@ from experiments.errors import UserError
 from experiments.figures import __main__ as figures
 from experiments.figures import paper
 from experiments.methods import METHODS
+from experiments.methods.base import EGOS
+from haland_jax import checkpoint
 
 ROOT = Path(__file__).parent.parent
 EXAMPLE = ROOT / "docs" / "examples" / "retrieval.py"
@@ -85,6 +87,8 @@ def test_all_methods_are_measured_beside_haland(smoke_run, compared_run):
         assert 0 < trained[name]["steps"] <= 1.5 * STEPS
         for curve in trained[name]["curve_returns"].values():
             assert np.shape(curve) == (2, len(trained[name]["curve_steps"]))
+        kept = checkpoint.read_metadata(compared_run / f"method_{name}" / EGOS)
+        assert kept is not None, "the trained egos stay"
     spoken = trained["no-fine-tuning"]["translations"]
     after = np.asarray(spoken["after"]["train"])
     assert np.shape(spoken["before"]["test"]) == (8, 4, after.shape[-1])

@@ -16,10 +16,13 @@ import jax
 from experiments.progress import StageProgress
 from experiments.stages import Run, load_archive, load_population
 from experiments.training import Saver
-from haland_jax import partners
+from haland_jax import checkpoint, partners
 from haland_jax.networks import Policy
 from haland_jax.partners import Player
 from haland_jax.rollout import Agent
+
+EGOS = "egos"
+"""The folder of a method's trained egos."""
 
 
 class Told(NamedTuple):
@@ -101,6 +104,10 @@ class Given:
     def path(self, name: str) -> Path:
         """Where the method may keep something."""
         return self.run.path(self.stage, name)
+
+    def keep(self, egos: Any) -> None:
+        """Keeps parameters of trained egos in the method's folder, for whoever plays them later."""
+        checkpoint.save(self.path(EGOS), egos)
 
     def saver(self, name: str) -> Saver:
         """Keeps the state of a long training, so that an interrupted one goes on."""

@@ -64,6 +64,7 @@ class SelfPlay:
         )
         steps = training.num_updates * training.steps_per_update
         points = curve_points(len(returns))
+        given.keep(players.ego.actor)
         return Trained(
             egos={SELF_PLAY: _in_turn(players.ego.actor, given.seeds)},
             descriptions={
@@ -109,6 +110,7 @@ class FictitiousCoPlay:
         ego_steps = ego_config.num_updates * ego_config.steps_per_update
         steps = ego_steps + POOL * first * pool_config.steps_per_update
         points = curve_points(len(returns))
+        given.keep(players.ego.actor)
         return Trained(
             egos={FCP: _in_turn(players.ego.actor, given.seeds)},
             descriptions={

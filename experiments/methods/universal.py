@@ -62,7 +62,9 @@ class RecurrentEgos:
             given.task.update,
             "universal egos with a memory",
         )
-        egos = recurrent_ppo.egos_by_style(env, recurrent_ppo.raw_actors(state))
+        actors = recurrent_ppo.raw_actors(state)
+        given.keep(actors)
+        egos = recurrent_ppo.egos_by_style(env, actors)
         steps = training.num_updates * training.steps_per_update
         what = "one ego with a memory for all styles, {}, " + f"{steps_in_words(steps)} steps"
         points = curve_points(len(returns))
