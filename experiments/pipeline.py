@@ -91,10 +91,14 @@ def collect_results(run: Run) -> dict[str, Any]:
 
 
 def _universal(run: Run, measured: dict[str, Any]) -> dict[str, Any]:
-    """How the universal egos learnt, and what the best responses cost beside them."""
+    """How the universal egos learnt, and what the best responses cost beside them.
+
+    They cost the pairs that they start from, those of held-out partners not among them, and their
+    refits.
+    """
     config = run.config.partners
     styles = len(run.env.style_names)
-    pairs = styles * config.num_seeds * config.joint.num_updates * config.joint.steps_per_update
+    pairs = styles * config.known_seeds * config.joint.num_updates * config.joint.steps_per_update
     starts = 2 if config.universal_start else 1
     refits = styles * starts * config.train_seeds
     refits *= config.refit.num_updates * config.refit.steps_per_update
