@@ -150,5 +150,8 @@ class DrawnEnvironment(Environment, Protocol):
 
     @property
     def viewer(self) -> ModuleType:
-        """Module with `draw_state(env, state, …)`, `save_gif(path, env, states, …)`, `save_png`."""
+        """Module with `draw_state(env, state, …)`, `save_gif(path, env, states, …)`, `save_png`.
+
+        Where people can play (actions are keys), also `draw_board(env, state, …)`: the game alone.
+        """
         ...

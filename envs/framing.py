@@ -10,7 +10,8 @@ from envs.drawing import Panel, Rect, Scene, Shape, Text, circle, place, text_wi
 
 INK = "#2b2f38"
 PROGRESS = "#f28c28"
-_PAGE, _MUTED, _TRACK = "#fffdf8", "#6b7280", "#e6e0d4"
+PAGE = "#fffdf8"
+_MUTED, _TRACK = "#6b7280", "#e6e0d4"
 _MARGIN, _HEADER_HEIGHT = 10.0, 52.0
 _CAPTION_SIZE, _CAPTION_LEADING = 13.0, 18.0
 
@@ -68,7 +69,7 @@ def frame(
         footer_height = _MARGIN * 2 + _CAPTION_LEADING * (len(footer) - 1)
         panels.append(Panel(0, bottom, width, footer_height, footer))
         bottom += footer_height
-    return Scene(width, bottom, _PAGE, tuple(panels))
+    return Scene(width, bottom, PAGE, tuple(panels))
 
 
 def _header(

@@ -7,7 +7,7 @@ from typing import TYPE_CHECKING, NamedTuple
 import numpy as np
 
 from envs.drawing import Panel, Scene, Shape, place
-from envs.framing import Legend, frame
+from envs.framing import PAGE, Legend, frame
 from envs.lbf import sprites
 from envs.lbf.dynamics import State
 from envs.lbf.sprites import TILE
@@ -25,7 +25,6 @@ class _View(NamedTuple):
 
     players: tuple[tuple[int, int], ...]
     foods: dict[tuple[int, int], int]  # levels of those still there
-    time: int
 
 
 def draw_state(
@@ -53,10 +52,26 @@ def draw_state(
         ValueError: the state does not belong to the environment, or has impossible values; or the
             style is not a single one.
     """
+    board = draw_board(env, state, style=style)
+    return frame(
+        board.panels,
+        board.width,
+        board.height,
+        title=env.name if title is None else title,
+        score=score,
+        time=int(np.asarray(state.time)),
+        max_steps=max_steps or env.max_steps,
+        caption=caption,
+        legend=() if style is None else (_WANTED,),
+    )
+
+
+def draw_board(env: Spread, state: State, *, style: Style | None = None) -> Scene:
+    """Draw the field alone, a panel a cell, row by row; arguments and errors as `draw_state`."""
     view = _read_state(env, state)
     target = None if style is None else _target(style, len(env.style_names))
     contents = _contents(view, target, len(env.style_names))
-    panels = [
+    panels = tuple(
         Panel(
             column * TILE,
             row * TILE,
@@ -66,18 +81,8 @@ def draw_state(
         )
         for row in range(env.rows)
         for column in range(env.columns)
-    ]
-    return frame(
-        panels,
-        env.columns * TILE,
-        env.rows * TILE,
-        title=env.name if title is None else title,
-        score=score,
-        time=view.time,
-        max_steps=max_steps or env.max_steps,
-        caption=caption,
-        legend=() if target is None else (_WANTED,),
     )
+    return Scene(env.columns * TILE, env.rows * TILE, PAGE, panels)
 
 
 def _read_state(env: Spread, state: State) -> _View:
@@ -96,7 +101,7 @@ def _read_state(env: Spread, state: State) -> _View:
     for cell in standing:
         if cell in present:
             raise ValueError(f"a player stands on the food at (row, column) {cell}")
-    return _View(standing, present, int(np.asarray(state.time)))
+    return _View(standing, present)
 
 
 def _integers(

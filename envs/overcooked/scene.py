@@ -8,7 +8,7 @@ from typing import TYPE_CHECKING, NamedTuple
 import numpy as np
 
 from envs.drawing import Panel, Scene, Shape, place
-from envs.framing import Legend, frame
+from envs.framing import PAGE, Legend, frame
 from envs.overcooked import chefs, sprites
 from envs.overcooked.dynamics import State
 from envs.overcooked.layouts import Layout
@@ -29,7 +29,6 @@ class _View(NamedTuple):
     held: tuple[int, ...]
     counters: tuple[int, ...]
     pots: tuple[tuple[int, int], ...]  # (content, timer)
-    time: int
 
 
 def draw_state(
@@ -57,6 +56,23 @@ def draw_state(
     Raises:
         ValueError: the state or the style does not belong to the layout, or has impossible values.
     """
+    board = draw_board(env, state, style=style)
+    closed = style is not None and any(_forbidden(env.layout, style, state))
+    return frame(
+        board.panels,
+        board.width,
+        board.height,
+        title=env.layout.name if title is None else title,
+        score=score,
+        time=int(np.asarray(state.time)),
+        max_steps=max_steps or env.max_steps,
+        caption=caption,
+        legend=(_CLOSED,) if closed else (),
+    )
+
+
+def draw_board(env: Overcooked, state: State, *, style: Style | None = None) -> Scene:
+    """Draw the kitchen alone, a panel a tile, row by row; arguments and errors as `draw_state`."""
     layout = env.layout
     view = _read_state(layout, state)
     forbidden_cells, forbidden_stations = _forbidden(layout, style, state)
@@ -68,17 +84,7 @@ def draw_state(
             fixed = _fixed_tile(layout, x, y, kind, (x, y) in closed)
             shapes = fixed + contents.get((x, y), ())
             panels.append(Panel(x * TILE, y * TILE, TILE, TILE, shapes))
-    return frame(
-        panels,
-        layout.width * TILE,
-        layout.height * TILE,
-        title=layout.name if title is None else title,
-        score=score,
-        time=view.time,
-        max_steps=max_steps or env.max_steps,
-        caption=caption,
-        legend=(_CLOSED,) if closed else (),
-    )
+    return Scene(layout.width * TILE, layout.height * TILE, PAGE, tuple(panels))
 
 
 # --- Reading states ------------------------------------------------------------------------------
@@ -118,7 +124,6 @@ def _read_state(layout: Layout, state: State) -> _View:
         held=held,
         counters=counters,
         pots=tuple(zip(contents, timers, strict=True)),
-        time=int(np.asarray(state.time)),
     )
 
 

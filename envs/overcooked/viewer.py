@@ -6,11 +6,12 @@ save_gif("episode.gif", env, states, style=style, scores=scores, title="left")
 """
 
 from envs.drawing import to_array, to_image, to_svg
-from envs.overcooked.scene import draw_state
+from envs.overcooked.scene import draw_board, draw_state
 from envs.pictures import save_gif, save_png, save_svg
 
 __all__ = [
     "FPS",
+    "draw_board",
     "draw_state",
     "save_gif",
     "save_png",
