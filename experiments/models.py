@@ -2,6 +2,8 @@
 
 from pathlib import Path
 
+import jax
+
 from envs.instructions import Instructions, load_instructions
 from experiments.configs import DEFAULT_ENVIRONMENT
 from experiments.errors import UserError, as_user_error, choose
@@ -40,10 +42,18 @@ def model_of_run(path: Path) -> TrainedModel:
     """
     # What only a run's folder needs takes seconds to import.
     from experiments.finished_run import open_run
-    from experiments.stages import load_archive, load_haland, load_population, load_task_language
+    from experiments.stages import (
+        load_archive,
+        load_haland,
+        load_population,
+        load_task_language,
+        load_universal,
+    )
+    from haland_jax.universal import TOLD_NOTHING
 
     run = open_run(path)
     language = load_task_language(run)
+    untold = load_universal(run)[TOLD_NOTHING].actor  # [style, seed]; the same for all styles
     return TrainedModel(
         env=run.env,
         haland=load_haland(run),
@@ -51,6 +61,7 @@ def model_of_run(path: Path) -> TrainedModel:
         oracles=load_archive(run).oracles,
         event_names=language.event_names,
         event_scale=language.scale,
+        universal=jax.tree.map(lambda leaf: leaf[0], untold),
     )
 
 

@@ -62,6 +62,8 @@ class TrainedModel:
         oracles: the best ego known for each of them, actors [style, seed].
         event_names: names of the task language's dimensions, U of them.
         event_scale: events a step that 1 stands for in the task language, float32 [U].
+        universal: egos for partners of all styles, which are told nothing, actors [seed]; None
+            where there are none.
     """
 
     env: Any
@@ -70,6 +72,7 @@ class TrainedModel:
     oracles: Policy
     event_names: tuple[str, ...]
     event_scale: jax.Array
+    universal: Policy | None = None
 
     @property
     def held_out_seeds(self) -> int:
@@ -143,11 +146,13 @@ def write(
         "oracles": model.oracles["params"],
         "language": {"v_hat": haland.v_hat, "scale": model.event_scale},
     }
+    if model.universal is not None:
+        parts["universal"] = model.universal["params"]
     exact = ()
     if policy_vae.STATISTICS in haland.vae_params:
         parts["observations"] = haland.vae_params[policy_vae.STATISTICS]
         # Where a number hardly varies, their weights are a hundred times larger than the others.
-        exact = ("held_out_partners", "oracles")
+        exact = ("held_out_partners", "oracles", "universal")
     packed = compact.pack(parts, exact)
     folder.mkdir(parents=True, exist_ok=True)
     safetensors.numpy.save_file(packed, folder / ARRAYS)
@@ -232,6 +237,7 @@ def read(folder: Path) -> TrainedModel:
         oracles=oracles,
         event_names=tuple(stored["events"]),
         event_scale=parts["language"]["scale"],
+        universal={"params": parts["universal"]} if "universal" in parts else None,
     )
 
 

@@ -7,6 +7,7 @@ import os
 os.environ.setdefault("TF_CPP_MIN_LOG_LEVEL", "3")
 os.environ.setdefault("TRANSFORMERS_NO_ADVISORY_WARNINGS", "1")
 
+import databases
 import filelock
 import hypothesis
 import jax
@@ -89,3 +90,20 @@ def smoke_run(tmp_path_factory, worker_id):
             with compiled_lightly():
                 run_pipeline(configs.smoke(configs.DEFAULT_ENVIRONMENT, seed=0), path)
     return path
+
+
+@pytest.fixture(scope="session")
+def postgres():
+    """A PostgreSQL server for these tests."""
+    if databases.postgres_programs() is None:
+        pytest.skip("PostgreSQL's server is not installed")
+    with databases.postgres_server() as url:
+        yield url
+
+
+@pytest.fixture(params=["sqlite", "postgresql"])
+def database_url(request, tmp_path):
+    """A new, empty database."""
+    if request.param == "sqlite":
+        return f"sqlite:///{tmp_path / 'study.db'}"
+    return databases.new_database(request.getfixturevalue("postgres"))

@@ -13,7 +13,8 @@ import jax.numpy as jnp
 import numpy as np
 from flax.struct import PyTreeNode
 
-from envs.base import Environment, Pair
+from envs.base import DrawnEnvironment, Environment, Pair
+from envs.drawing import Scene
 from haland_jax import networks
 from haland_jax.networks import Policy
 
@@ -68,7 +69,7 @@ class Arena:
         size: how many games can go on at once.
     """
 
-    def __init__(self, env: Environment, size: int, policy: Policy):
+    def __init__(self, env: DrawnEnvironment, size: int, policy: Policy):
         """Makes the seats; `compile` makes the programs.
 
         Args:
@@ -87,6 +88,11 @@ class Arena:
         self._advance = jax.jit(partial(_advance, env), donate_argnums=0, compiler_options=options)
         self._replay = jax.jit(partial(_replay, env), compiler_options=options)
         self._put = jax.jit(_put, donate_argnums=0)
+        hosted = _on_host(env.styles)
+        self._styles = [
+            jax.tree.map(lambda leaf, i=index: leaf[i], hosted)
+            for index in range(len(env.style_names))
+        ]
         one = self._begin(jax.random.key(0), self._style(0), policy)
         self._seats = jax.tree.map(lambda leaf: jnp.stack([leaf] * size), one)
 
@@ -135,6 +141,10 @@ class Arena:
         """
         self._seats, played = self._advance(self._seats, partner_actions, playing)
         return Played(*map(np.asarray, played)), _on_host(self._seats.state)
+
+    def draw(self, state: Any, style: int) -> Scene:
+        """One state as the player sees it, with what the style forbids or wants."""
+        return self.env.viewer.draw_board(self.env, state, style=self._styles[style])
 
     def replay(self, style: int, seed: int, actions: Pair) -> Replay:
         """Plays a recorded game again; actions as of `resume`."""
