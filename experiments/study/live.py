@@ -278,9 +278,10 @@ class Hall:
     async def save(self) -> None:
         """Stores all steps that are not stored yet, in one transaction."""
         taken = [(live, *self._take(live)) for live in list(self.rounds.values())]
-        parts = [
-            (live.number, first, recording.pack(steps)) for live, first, steps in taken if steps
-        ]
+        parts: list[tuple[int, int, bytes]] = []
+        for live, first, steps in taken:
+            if live.number is not None and steps:
+                parts.append((live.number, first, recording.pack(steps)))
         if not parts:
             return
         try:
