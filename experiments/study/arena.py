@@ -142,6 +142,10 @@ class Arena:
         self._seats, played = self._advance(self._seats, partner_actions, playing)
         return Played(*map(np.asarray, played)), _on_host(self._seats.state)
 
+    def first_state(self) -> Any:
+        """A state to draw, NumPy."""
+        return _on_host(jax.tree.map(lambda leaf: leaf[0], self._seats.state))
+
     def draw(self, state: Any, style: int) -> Scene:
         """One state as the player sees it, with what the style forbids or wants."""
         return self.env.viewer.draw_board(self.env, state, style=self._styles[style])

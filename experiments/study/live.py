@@ -189,7 +189,7 @@ class Hall:
         live.changed.set()
         if live.number is not None:
             number, timing = live.number, live.timing()
-            await self._in_writer(lambda: self._end(number, status, timing))
+            await self.in_writer(lambda: self._end(number, status, timing))
 
     # --- The clock -------------------------------------------------------------------------------
 
@@ -285,7 +285,7 @@ class Hall:
         if not parts:
             return
         try:
-            await self._in_writer(lambda: self._save(parts))
+            await self.in_writer(lambda: self._save(parts))
         except BaseException:
             for live, first, steps in taken:  # to be stored another time
                 live.unsaved[:0], live.saved = steps, first
@@ -318,7 +318,8 @@ class Hall:
             self._player, lambda: function(*arguments)
         )
 
-    async def _in_writer(self, function: Callable[[], Any]) -> Any:
+    async def in_writer(self, function: Callable[[], Any]) -> Any:
+        """Runs a function that uses the database, after those that were asked for before."""
         return await asyncio.get_running_loop().run_in_executor(self._writer, function)
 
 
