@@ -7,6 +7,7 @@
     python -m experiments.benchmark ppo                   training pairs of players
     python -m experiments.benchmark ppo --learner recurrent    training egos with a memory
     python -m experiments.benchmark brax RUN              training one player, beside Brax's PPO
+    python -m experiments.benchmark study                 the web study with fifty players
 
 Absolute figures drift with the machine's load; ratios of one run hold.
 """
@@ -153,12 +154,31 @@ class BraxArguments:
     """Write the result as JSON too."""
 
 
+@dataclasses.dataclass(frozen=True)
+class StudyArguments:
+    """Measure the web study with many players at once, each in a round of their own.
+
+    A server of its own, 6 steps a second; players press buttons at random over real connections
+    from this process, on the same cores.
+    """
+
+    players: int = 50
+    """Players at once."""
+    seconds: float = 30.0
+    """How long they play; a round ends after 67 seconds."""
+    cores: int = 1
+    """Devices of this process, which computes nothing."""
+    json: Annotated[Path | None, tyro.conf.arg(metavar="OUT")] = None
+    """Write the result as JSON too."""
+
+
 Arguments = (
     Annotated[EnvArguments, tyro.conf.subcommand("env")]
     | Annotated[LbfArguments, tyro.conf.subcommand("lbf")]
     | Annotated[ArmArguments, tyro.conf.subcommand("arm")]
     | Annotated[PpoArguments, tyro.conf.subcommand("ppo")]
     | Annotated[BraxArguments, tyro.conf.subcommand("brax")]
+    | Annotated[StudyArguments, tyro.conf.subcommand("study")]
 )
 
 
@@ -263,7 +283,7 @@ def _check(arguments: Arguments) -> None:
     if isinstance(arguments, PpoArguments):
         choose("environment", arguments.env, envs.names(styled_only=True))
         return
-    if isinstance(arguments, BraxArguments):
+    if isinstance(arguments, BraxArguments | StudyArguments):
         return
     if isinstance(arguments, LbfArguments):
         for encoding in arguments.encodings:
@@ -333,6 +353,13 @@ def main() -> None:
 
         found = _compare_learners(arguments, benchmark_brax, console.print)
         console.print(benchmark_brax.brax_table(found))
+    elif isinstance(arguments, StudyArguments):
+        # The server's libraries, too.
+        from experiments import benchmark_study
+
+        found = benchmark_study.measure_study(arguments.players, arguments.seconds)
+        found["machine"] = machine()
+        console.print(benchmark_study.study_table(found))
     elif isinstance(arguments, LbfArguments):
         batch, steps = arguments.batch, arguments.steps
         engines = benchmark_lbf.measure_fields(arguments.encodings, batch, steps, arguments.repeats)

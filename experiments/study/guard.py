@@ -14,7 +14,7 @@ MOST_FRAME_BYTES = 512
 _HEADERS = {
     b"content-security-policy": b"default-src 'self'; frame-ancestors 'none'; form-action 'self'",
     b"x-content-type-options": b"nosniff",
-    b"referrer-policy": b"no-referrer",
+    b"referrer-policy": b"same-origin",
     b"cache-control": b"no-store",
 }
 _log = logging.getLogger("experiments.study.refused")

@@ -11,7 +11,7 @@ import dataclasses
 import logging
 import time
 from collections import deque
-from collections.abc import Callable, Iterable
+from collections.abc import Callable
 from concurrent.futures import ThreadPoolExecutor
 from typing import Any
 
@@ -97,7 +97,6 @@ class Hall:
 
     def __init__(
         self,
-        arenas: Iterable[Arena],
         hertz: float,
         save: Callable[[list[tuple[int, int, bytes]]], None],
         end: Callable[[int, str, dict[str, float]], None],
@@ -105,22 +104,27 @@ class Hall:
         """Prepares an empty hall; `run` is the clock.
 
         Args:
-            arenas: one an environment.
             hertz: ticks a second.
             save: stores steps: round, first step, packed steps.
             end: stores that a round ended: its number, its status, its timing.
         """
         self.hertz = hertz
-        self.arenas = {arena.env.name: arena for arena in arenas}
+        self.arenas: dict[str, Arena] = {}
         self.pictures = Pictures()
         self.rounds: dict[str, Live] = {}
         self.late: deque[float] = deque(maxlen=int(60 * hertz))
-        self._free = {name: list(range(a.size)) for name, a in self.arenas.items()}
+        self._free: dict[str, list[int]] = {}
         self._save, self._end = save, end
         # JAX and the database each have a thread, so that neither makes the clock wait.
         self._player = ThreadPoolExecutor(1, "arena")
         self._writer = ThreadPoolExecutor(1, "writer")
         self._saving: asyncio.Task[None] | None = None
+
+    def add(self, arena: Arena) -> None:
+        """Adds a compiled arena."""
+        name = arena.env.name
+        self._free[name] = list(range(arena.size))
+        self.arenas = {**self.arenas, name: arena}  # the clock may be looking
 
     # --- Rounds ----------------------------------------------------------------------------------
 

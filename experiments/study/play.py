@@ -80,7 +80,7 @@ async def connect(socket: WebSocket, hall: Hall, live: Live) -> None:
             live.listener, live.absent_since = None, time.monotonic()
             live.hands.let_go()
         if socket.application_state is WebSocketState.CONNECTED:
-            with contextlib.suppress(RuntimeError):
+            with contextlib.suppress(RuntimeError, WebSocketDisconnect):
                 await socket.close(TAKEN_OVER if live.listener is not None else 1000)
 
 

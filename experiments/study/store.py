@@ -74,6 +74,11 @@ class Store:
             config.attributes["connection"] = connection
             command.upgrade(config, "head")
 
+    @property
+    def shown_url(self) -> str:
+        """Where the database is, without the password."""
+        return self._engine.url.render_as_string(hide_password=True)
+
     def close(self) -> None:
         """Closes all connections."""
         self._engine.dispose()

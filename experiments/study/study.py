@@ -2,7 +2,6 @@
 
 import dataclasses
 import secrets
-from collections.abc import Mapping
 from functools import partial
 from typing import Any
 
@@ -10,7 +9,7 @@ import jax
 import numpy as np
 
 from experiments.study import store, tables
-from experiments.study.agents import UNIVERSAL, Agents, Made, new_seed
+from experiments.study.agents import Agents, Made, new_seed
 from experiments.study.arena import Arena
 from experiments.study.live import Hall, Live
 from experiments.study.pictures import Pictures, changes, tiles_of
@@ -79,34 +78,11 @@ class Study:
         beginning: rounds that are stored and not yet in the hall.
     """
 
-    def __init__(self, settings: Settings, store: Store, models: Mapping[str, TrainedModel]):
-        """Prepares a study.
-
-        Args:
-            settings: what it is.
-            store: its database.
-            models: trained models by the name that they were asked for with.
-
-        Raises:
-            ValueError: a model cannot be played with keys, or lacks a kind of agent.
-        """
+    def __init__(self, settings: Settings, store: Store):
+        """A study without games; `add` the one that it is about first."""
         self.settings, self.store = settings, store
-        kitchens = [Kitchen(name, model, settings.players) for name, model in models.items()]
-        self.kitchens = {kitchen.env.name: kitchen for kitchen in kitchens}
-        self.kitchen = kitchens[0]
-        for condition in settings.conditions:
-            if condition not in self.kitchen.agents.conditions:
-                hint = (
-                    "; it comes with a run of your own, python -m experiments.run"
-                    if condition == UNIVERSAL
-                    else ""
-                )
-                raise ValueError(
-                    f"the model {self.kitchen.name} has no agent '{condition}', only "
-                    f"{', '.join(self.kitchen.agents.conditions)}{hint}"
-                )
+        self.kitchens: dict[str, Kitchen] = {}
         self.hall = Hall(
-            [kitchen.arena for kitchen in kitchens],
             settings.hertz,
             store.add_steps,
             lambda number, status, timing: store.end_round(number, status, timing=timing),
@@ -114,11 +90,34 @@ class Study:
         self.beginning: set[str] = set()
         self._demonstration: dict[str, Any] | None = None
 
-    def compile(self) -> None:
-        """Compiles everything, and plays the demonstration."""
-        for kitchen in self.kitchens.values():
-            kitchen.compile()
-        self._demonstration = self._demonstrate()
+    def add(self, name: str, model: TrainedModel) -> None:
+        """Compiles a game, and lets people play it.
+
+        Args:
+            name: how the model was asked for.
+            model: a trained model.
+
+        Raises:
+            ValueError: it cannot be played with keys, or the study's lacks a kind of agent.
+        """
+        kitchen = Kitchen(name, model, self.settings.players)
+        if not self.kitchens:
+            for condition in self.settings.conditions:
+                if condition not in kitchen.agents.conditions:
+                    raise ValueError(
+                        f"the model {name} has no agent '{condition}', only "
+                        f"{', '.join(kitchen.agents.conditions)}"
+                    )
+        kitchen.compile()
+        if not self.kitchens:
+            self._demonstration = self._demonstrate(kitchen)
+        self.hall.add(kitchen.arena)
+        self.kitchens[kitchen.env.name] = kitchen
+
+    @property
+    def kitchen(self) -> Kitchen:
+        """The game that the study is about."""
+        return next(iter(self.kitchens.values()))
 
     # --- Participants ----------------------------------------------------------------------------
 
@@ -233,7 +232,7 @@ class Study:
     @property
     def demonstration(self) -> dict[str, Any]:
         """A game of an agent and a trained partner, for the page."""
-        assert self._demonstration is not None, "compile first"
+        assert self._demonstration is not None, "add a game first"
         return self._demonstration
 
     def replay(self, one: tables.Round) -> dict[str, Any]:
@@ -250,9 +249,9 @@ class Study:
             raise ValueError(f"round {one.id} earns something else when it is played again")
         return film(kitchen.arena, again.states, style, again.rewards, one.hertz)
 
-    def _demonstrate(self) -> dict[str, Any]:
+    def _demonstrate(self, kitchen: Kitchen) -> dict[str, Any]:
         """The first style's first trained partner, with the agent that knows it best."""
-        kitchen, style = self.kitchen, 0
+        style = 0
         env, model = kitchen.env, kitchen.model
         ego, partner = (
             jax.tree.map(lambda leaf: leaf[style, 0], policies)
