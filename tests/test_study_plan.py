@@ -92,6 +92,10 @@ def test_damaged_recordings_are_noticed():
         recording.unpack([(0, whole), (0, whole)])
     with pytest.raises(ValueError, match="the steps from 0 on are 31 bytes, no whole steps"):
         recording.unpack([(0, whole[:-1])])
+    chunks = [(6, whole), (0, whole), (4, whole[:9])]
+    assert len(recording.sound_part(chunks)) == 4
+    assert len(recording.sound_part([(0, whole), (6, whole)])) == 4
+    assert len(recording.sound_part([])) == 0
 
 
 def test_boards_share_pictures_and_tell_what_changed():

@@ -52,6 +52,7 @@ class Live:
         changed: set after every change, for who sends them.
         listener: identifies the connection that plays now.
         absent_since: when the player was last seen, `time.monotonic`; None while connected.
+        leaving: whether its end is being stored.
     """
 
     number: int | None
@@ -70,6 +71,7 @@ class Live:
     changed: asyncio.Event = dataclasses.field(default_factory=asyncio.Event)
     listener: object | None = None
     absent_since: float | None = dataclasses.field(default_factory=time.monotonic)
+    leaving: bool = False
 
     def timing(self) -> dict[str, float]:
         """How evenly the game ran, for the researcher."""
@@ -182,18 +184,21 @@ class Hall:
     async def leave(self, key: str, status: str = BROKEN) -> None:
         """Ends a round: stores what is left, frees its seat."""
         live = self.rounds.get(key)
-        if live is None:
+        if live is None or live.leaving:
             return
-        live.listener = None  # no more steps
-        if live.number is not None:
-            await self.save()
-        if self.rounds.pop(key, None) is None:
-            return  # another task was faster
+        live.leaving, live.listener = True, None  # no more steps
+        try:
+            if live.number is not None:
+                await self.save()
+                number, timing = live.number, live.timing()
+                # Found until the database knows, so that nobody takes it for lost.
+                await self.in_writer(lambda: self._end(number, status, timing))
+        except BaseException:
+            live.leaving = False  # to be tried again
+            raise
+        del self.rounds[key]
         self._free[live.arena.env.name].append(live.seat)
         live.changed.set()
-        if live.number is not None:
-            number, timing = live.number, live.timing()
-            await self.in_writer(lambda: self._end(number, status, timing))
 
     # --- The clock -------------------------------------------------------------------------------
 
@@ -211,8 +216,7 @@ class Hall:
             if time.monotonic() - saved >= SECONDS_BETWEEN_SAVES:
                 saved = time.monotonic()
                 if self._saving is None or self._saving.done():
-                    self._saving = asyncio.create_task(self._save_and_log())
-                await self._drop_the_absent()
+                    self._saving = asyncio.create_task(self._save_and_drop())
             # A tick that came so late that the next one is due too does not make two.
             due = max(due + period, time.monotonic())
 
@@ -302,11 +306,13 @@ class Hall:
         live.saved, live.unsaved = first + len(steps), []
         return first, steps
 
-    async def _save_and_log(self) -> None:
+    async def _save_and_drop(self) -> None:
+        """What happens beside the clock, once a second."""
         try:
             await self.save()
+            await self._drop_the_absent()
         except Exception:
-            _log.exception("steps could not be stored")
+            _log.exception("steps could not be stored; they will be tried again")
 
     async def close(self) -> None:
         """Stores everything; rounds that were going on can be gone on with."""

@@ -38,6 +38,18 @@ def unpack(chunks: Iterable[tuple[int, bytes]]) -> np.ndarray:
     return np.concatenate(parts) if parts else np.zeros(0, STEP)
 
 
+def sound_part(chunks: Iterable[tuple[int, bytes]]) -> np.ndarray:
+    """The steps before the first damage, [T] of `STEP`; arguments as `unpack`."""
+    kept: list[tuple[int, bytes]] = []
+    for chunk in sorted(chunks):
+        try:
+            unpack([*kept, chunk])
+        except ValueError:
+            break
+        kept.append(chunk)
+    return unpack(kept)
+
+
 def actions_of(steps: np.ndarray) -> Pair:
     """Both players' actions, `Pair` of int32 [T]."""
     return Pair(steps["ego"].astype(np.int32), steps["person"].astype(np.int32))

@@ -151,10 +151,15 @@ class Store:
     def end_round(
         self, number: int, status: str, *, timing: Mapping[str, Any] | None = None
     ) -> None:
-        """Marks a round as finished or broken; steps and score come from what is stored."""
+        """Marks a round as finished or broken; steps and score come from what is stored.
+
+        Raises:
+            ValueError: it is said to be finished, but its recording is damaged.
+        """
+        read = recording.sound_part if status == BROKEN else recording.unpack
         with self.session() as session:
             one = session.get_one(Round, number)
-            steps = recording.unpack((c.first, c.data) for c in one.chunks)
+            steps = read((c.first, c.data) for c in one.chunks)
             one.status, one.ended = status, _now()
             one.steps, one.score = len(steps), float(steps["reward"].sum())
             one.timing = None if timing is None else dict(timing)
