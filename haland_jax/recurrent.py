@@ -59,8 +59,8 @@ def _remember_forwards(
     """What `remember` returns, and what its gradient needs."""
     # The logistic function is a hyperbolic tangent: one call of it makes all gates.
     units = kernel.shape[0]
-    scale = np.repeat(np.float32([0.5, 0.5, 1.0, 0.5]), units)
-    shift = np.repeat(np.float32([0.5, 0.5, 0.0, 0.5]), units)
+    scale = np.repeat(np.array([0.5, 0.5, 1.0, 0.5], np.float32), units)
+    shift = np.repeat(np.array([0.5, 0.5, 0.0, 0.5], np.float32), units)
 
     def step(memory: Memory, now: tuple[jax.Array, jax.Array]):
         given, going_on = now
