@@ -2,6 +2,7 @@
 
     python -m experiments.evaluate
     python -m experiments.evaluate --run FOLDER --instructions mine.toml --json out.json
+    python -m experiments.evaluate --run FOLDER --partners proxies
 
 The model is one that comes with the package, or a run of your own (`--run`).
 
@@ -41,6 +42,9 @@ class Arguments:
     """Folder of a finished run, or a model that comes with the package."""
     instructions: Annotated[Path | None, tyro.conf.arg(metavar="FILE")] = None
     """TOML file: style name = list of sentences; the packaged test sentences by default."""
+    partners: Annotated[Path | None, tyro.conf.arg(metavar="FOLDER")] = None
+    """Human proxies to play with (`python -m experiments.proxies`), in place of the held-out
+    partners; only styles that have some are measured."""
     json: Annotated[Path | None, tyro.conf.arg(metavar="OUT")] = None
     """Write the result as JSON too."""
     games: int = 16
@@ -141,9 +145,49 @@ def measure(
     }
 
 
+def with_proxies(
+    model: TrainedModel, sentences: dict[str, list[str]], folder: Path
+) -> tuple[TrainedModel, dict[str, list[str]]]:
+    """The model with human proxies in place of its held-out partners.
+
+    The Oracle is then the ego that knows a trained partner of the style best, as people have none
+    of their own.
+
+    Returns:
+        The model, and the sentences of those styles that have proxies.
+
+    Raises:
+        UserError: there are no proxies, those of another environment, or none of these styles.
+    """
+    from experiments import proxies
+
+    found = proxies.load(folder)
+    env = model.env
+    if found.environment != env.name:
+        raise UserError(f"{folder} has proxies of {found.environment}, the model is of {env.name}")
+    spoken = {style: said for style, said in sentences.items() if style in found.styles}
+    if not spoken:
+        raise UserError(
+            f"{folder} has proxies of {', '.join(found.styles)}; none of {', '.join(sentences)}"
+        )
+    rows = np.array([env.style_names.index(style) for style in found.styles])
+    seeds = jax.tree.leaves(found.policies)[0].shape[1]
+
+    def placed(leaf: jax.Array) -> jax.Array:
+        empty = jnp.zeros((len(env.style_names), *leaf.shape[1:]), leaf.dtype)
+        return empty.at[rows].set(leaf)
+
+    egos = np.arange(seeds) % model.held_out_seeds
+    return dataclasses.replace(
+        model,
+        held_out_partners=jax.tree.map(placed, found.policies),
+        oracles=jax.tree.map(lambda leaf: leaf[:, egos], model.oracles),
+    ), spoken
+
+
 def table_of(found: dict[str, Any]) -> Table:
     """The result by style as a table for the terminal."""
-    table = Table(title=f"Held-out partners, {found['environment']}")
+    table = Table(title=f"{found['partners'].capitalize()}, {found['environment']}")
     table.add_column("style")
     succeeds = {"success": "success", "oracle_success": "Oracle's success"}
     succeeds = {name: title for name, title in succeeds.items() if name in found["mean"]}
@@ -185,7 +229,11 @@ def main() -> None:
         sentences = read_sentences(arguments.instructions, model.env.style_names)
     else:
         sentences = {name: list(style.test) for name, style in instructions_of(model).items()}
-    found = measure(model, sentences, arguments.games, arguments.seed)
+    whom = "held-out partners"
+    if arguments.partners is not None:
+        model, sentences = with_proxies(model, sentences, arguments.partners)
+        whom = "human proxies"
+    found = {**measure(model, sentences, arguments.games, arguments.seed), "partners": whom}
     Console().print(table_of(found))
     if arguments.json is not None:
         arguments.json.write_text(json.dumps(found, indent=1) + "\n", encoding="utf-8")

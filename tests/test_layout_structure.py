@@ -40,6 +40,7 @@ ORDER = (
     "deployment",
     "compact",
     "pretrained",
+    "behaviour_cloning",
 )
 FORBIDDEN = {"utils", "util", "helpers", "helper", "common", "misc", "manager"}
 PYTHON_FILES = sorted(

@@ -53,12 +53,12 @@ class Replay(NamedTuple):
     Attributes:
         states: leading axis [T + 1].
         rewards: team reward of each step.
-        ego_actions: what the recording says that the ego did.
+        observations: what both players saw, `Pair` of [T + 1, O].
     """
 
     states: Any
     rewards: np.ndarray
-    ego_actions: np.ndarray
+    observations: Pair
 
 
 class Arena:
@@ -124,7 +124,7 @@ class Arena:
             style=self._style(style),
             policy=policy,
             state=jax.tree.map(lambda leaf: leaf[length], states),
-            observation=observations[length],
+            observation=observations.ego[length],
         )
         self._seats = self._put(self._seats, seat, one)
         return _on_host(one.state)
@@ -153,9 +153,11 @@ class Arena:
     def replay(self, style: int, seed: int, actions: Pair) -> Replay:
         """Plays a recorded game again; actions as of `resume`."""
         length = len(actions.ego)
-        states, rewards, _ = self._played_again(style, seed, actions)
-        kept = jax.tree.map(lambda leaf: np.asarray(leaf)[: length + 1], states)
-        return Replay(kept, np.asarray(rewards)[:length], np.asarray(actions.ego))
+        states, rewards, observations = self._played_again(style, seed, actions)
+        kept, seen = jax.tree.map(
+            lambda leaf: np.asarray(leaf)[: length + 1], (states, observations)
+        )
+        return Replay(kept, np.asarray(rewards)[:length], seen)
 
     def _played_again(self, style: int, seed: int, actions: Pair) -> Any:
         # Always as long as a whole game, so that there is one program.
@@ -206,15 +208,15 @@ def _advance(
 
 def _replay(
     env: Environment, key: jax.Array, style: Any, actions: Pair
-) -> tuple[Any, jax.Array, jax.Array]:
-    """States [T + 1], rewards [T] and the ego's observations [T + 1] of recorded actions [T]."""
+) -> tuple[Any, jax.Array, Pair]:
+    """States [T + 1], rewards [T] and observations [T + 1] of recorded actions [T]."""
     state, timestep = _start(env, key, style)
 
     def one(state: Any, now: tuple[jax.Array, Pair]) -> Any:
         step, actions = now
         _, env_key = _step_keys(key, step)
         state, timestep = env.step(env_key, state, actions, style)
-        return state, (state, timestep.reward, timestep.observation.ego)
+        return state, (state, timestep.reward, timestep.observation)
 
     steps = jnp.arange(actions.ego.shape[0], dtype=jnp.int32)
     _, (states, rewards, observations) = jax.lax.scan(one, state, (steps, actions))
@@ -223,7 +225,7 @@ def _replay(
         return jnp.concatenate([first[None], rest])
 
     states = jax.tree.map(with_first, state, states)
-    return states, rewards, with_first(timestep.observation.ego, observations)
+    return states, rewards, jax.tree.map(with_first, timestep.observation, observations)
 
 
 def _put(seats: Seats, seat: jax.Array, one: Seats) -> Seats:
