@@ -10,7 +10,6 @@ cloned from what they did, several for each style, each from rounds drawn with r
 """
 
 import dataclasses
-import json
 from collections.abc import Iterable
 from pathlib import Path
 from typing import Annotated, Any, NamedTuple
@@ -23,9 +22,9 @@ from rich.console import Console
 from rich.table import Table
 
 import envs
-from envs.base import Pair
 from experiments import devices
 from experiments.errors import UserError, main_guard
+from experiments.study.rounds import Recorded, read_rounds
 from haland_jax import behaviour_cloning, checkpoint
 from haland_jax.behaviour_cloning import CloningConfig, Demonstrations
 from haland_jax.learner import make_networks
@@ -48,16 +47,6 @@ class Arguments:
     """Steps of each fit."""
     seed: int = 0
     """Of the draws and the fits."""
-
-
-class Recorded(NamedTuple):
-    """A round: where and as what it was played, and what both did, `Pair` of int [T]."""
-
-    environment: str
-    style: str
-    game_seed: int
-    actions: Pair
-    rewards: np.ndarray
 
 
 class Proxies(NamedTuple):
@@ -102,65 +91,6 @@ def main() -> None:
         f"python -m experiments.evaluate --run MODEL --partners {arguments.out}",
         soft_wrap=True,
     )
-
-
-def read_rounds(source: str) -> list[Recorded]:
-    """The rounds of a study that were played to their end.
-
-    Raises:
-        UserError: there are none, or the source cannot be read.
-    """
-    found = _from_file(Path(source)) if source.endswith(".jsonl") else _from_database(source)
-    if not found:
-        raise UserError(
-            f"{source} holds no finished rounds; play some: python -m experiments.study"
-        )
-    return found
-
-
-def _from_file(path: Path) -> list[Recorded]:
-    try:
-        rows = [json.loads(line) for line in path.read_text(encoding="utf-8").splitlines()]
-        return [
-            Recorded(
-                row["environment"],
-                row["style"],
-                row["game_seed"],
-                Pair(*(np.array(row["recorded"][who], np.int32) for who in ("ego", "person"))),
-                np.array(row["recorded"]["reward"], np.float32),
-            )
-            for row in rows
-            if row["status"] == "finished"
-        ]
-    except OSError as error:
-        raise UserError(f"{path} cannot be read ({error.strerror})") from None
-    except (ValueError, KeyError, TypeError) as error:
-        raise UserError(f"{path} is no rounds.jsonl of a study ({error!r})") from None
-
-
-def _from_database(source: str) -> list[Recorded]:
-    from sqlalchemy.exc import SQLAlchemyError
-
-    from experiments.study.recording import actions_of
-    from experiments.study.store import Store
-    from experiments.study.tables import FINISHED
-
-    if "://" not in source:
-        file = Path(source) / "study.db"
-        if not file.is_file():
-            raise UserError(f"{file} is missing; name a study's folder, a URL or rounds.jsonl")
-        source = f"sqlite:///{file}"
-    try:
-        store = Store(source)
-    except SQLAlchemyError as error:
-        raise UserError(f"the database cannot be opened: {str(error).splitlines()[0]}") from None
-    found = []
-    for one in store.rounds(FINISHED):
-        steps = store.steps(one.id)
-        recorded = actions_of(steps), steps["reward"]
-        found.append(Recorded(one.environment, one.style, one.game_seed, *recorded))
-    store.close()
-    return found
 
 
 def make_proxies(

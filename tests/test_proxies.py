@@ -11,6 +11,7 @@ from experiments.errors import UserError
 from experiments.models import instructions_of, open_model
 from experiments.study import arena as arenas
 from experiments.study import export, recording
+from experiments.study.rounds import read_rounds
 from experiments.study.store import Begun, Store
 from experiments.study.tables import FINISHED
 from haland_jax import networks
@@ -82,7 +83,7 @@ def study(model, tmp_path_factory):
 
 @pytest.fixture(scope="module")
 def cloned(study):
-    rounds = proxies.read_rounds(str(study))
+    rounds = read_rounds(str(study))
     assert len(rounds) == 2 * ROUNDS
     return proxies.make_proxies(rounds, None, 2, CONFIG, jax.random.key(0))
 
@@ -116,25 +117,23 @@ def test_an_exported_file_gives_the_same_rounds(study, tmp_path):
     file = tmp_path / "rounds.jsonl"
     file.write_text("".join(export.rounds_jsonl(store)))
     store.close()
-    for one, other in zip(
-        proxies.read_rounds(str(file)), proxies.read_rounds(str(study)), strict=True
-    ):
-        assert one[:3] == other[:3]
+    for one, other in zip(read_rounds(str(file)), read_rounds(str(study)), strict=True):
+        assert one[:6] == other[:6]
         np.testing.assert_array_equal(np.array(one.actions), np.array(other.actions))
         np.testing.assert_array_equal(one.rewards, other.rewards)
 
 
 def test_what_cannot_be_cloned_is_refused(study, cloned, model, tmp_path):
     with pytest.raises(UserError, match=r"study\.db is missing; name a study's folder"):
-        proxies.read_rounds(str(tmp_path))
+        read_rounds(str(tmp_path))
     empty = tmp_path / "empty.jsonl"
     empty.write_text("")
     with pytest.raises(UserError, match="holds no finished rounds"):
-        proxies.read_rounds(str(empty))
+        read_rounds(str(empty))
     empty.write_text("{}\n")
     with pytest.raises(UserError, match=r"is no rounds\.jsonl of a study"):
-        proxies.read_rounds(str(empty))
-    rounds = proxies.read_rounds(str(study))
+        read_rounds(str(empty))
+    rounds = read_rounds(str(study))
     with pytest.raises(UserError, match="there are rounds of lbf/spread; name one with --env"):
         proxies.make_proxies(rounds, "overcooked/crossway", 1, CONFIG, jax.random.key(0))
     other = rounds[0]._replace(environment="a")
