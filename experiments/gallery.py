@@ -1,5 +1,6 @@
 """Pictures of play: an episode of a generated ego and a held-out partner for each style."""
 
+import functools
 from pathlib import Path
 from typing import Any
 
@@ -118,10 +119,15 @@ def moments(env: DrawnEnvironment, game: Recording) -> list[dict[str, Any]]:
 
 def state_of(env: DrawnEnvironment, leaves: list[Any]) -> Any:
     """The state of a game from its leaves as results.json has them."""
-    like, _ = jax.eval_shape(env.reset, jax.random.key(0), env.style(env.style_names[0]))
-    shapes, structure = jax.tree.flatten(like)
+    shapes, structure = _shapes_of_a_state(env)
     arrays = [np.asarray(leaf, shape.dtype) for leaf, shape in zip(leaves, shapes, strict=True)]
     return jax.tree.unflatten(structure, arrays)
+
+
+@functools.lru_cache(maxsize=8)
+def _shapes_of_a_state(env: DrawnEnvironment) -> tuple[list[jax.ShapeDtypeStruct], Any]:
+    state, _ = jax.eval_shape(env.reset, jax.random.key(0), env.style(env.style_names[0]))
+    return jax.tree.flatten(state)
 
 
 def _at(tree: Any, index: Any) -> Any:
