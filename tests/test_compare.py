@@ -9,12 +9,13 @@ import numpy as np
 import pytest
 from refused_command import refused
 
-from experiments import compare, configs, devices
+from experiments import compare, configs, devices, training
 from experiments.errors import UserError
 from experiments.figures import __main__ as figures
 from experiments.figures import paper
 from experiments.methods import METHODS
 from experiments.methods.base import EGOS
+from experiments.progress import StageProgress
 from haland_jax import checkpoint
 
 ROOT = Path(__file__).parent.parent
@@ -25,6 +26,14 @@ STEPS = 8000
 TRIED = tuple(name for name in compare.NAMES if name not in ("self-play", "cgan-unet"))
 
 pytestmark = [pytest.mark.timeout(1500), pytest.mark.light_compilation]
+
+
+@pytest.fixture(scope="module", autouse=True)
+def training_in_pieces():
+    """The egos' few updates are done in two pieces, as hundreds are in many."""
+    with pytest.MonkeyPatch.context() as patched:
+        patched.setattr(training, "UPDATES_PER_PIECE", 6)
+        yield
 
 
 @pytest.fixture(autouse=True)
@@ -108,6 +117,37 @@ def test_what_is_measured_is_not_measured_again(compared_run, tmp_path):
         compare.measure(copy, ("fcp",), 5000, 2)
     with pytest.raises(UserError, match="'universal' with seeds = 2 already, not 3"):
         compare.measure(copy, ("universal",), STEPS, 3)
+
+
+class Interrupted(Exception):
+    """Stands for the signal that ends a command."""
+
+
+@pytest.mark.slow
+def test_interrupted_methods_end_alike(monkeypatch, smoke_run, compared_run, tmp_path):
+    copy = Path(shutil.copytree(smoke_run, tmp_path / "copy"))
+    monkeypatch.setattr(training, "SECONDS_BETWEEN_CHECKPOINTS", 0.0)
+    update = StageProgress.update
+    heard: list[int] = []
+
+    def end_the_second_time(task, done, metrics=None):
+        heard.append(done)
+        if len(heard) == 2:
+            raise Interrupted
+        update(task, done, metrics)
+
+    monkeypatch.setattr(StageProgress, "update", end_the_second_time)
+    for name in ("universal", "fcp"):
+        heard.clear()
+        with pytest.raises(Interrupted):
+            compare.measure(copy, (name,), STEPS, 2)
+        compare.measure(copy, (name,), STEPS, 2)
+        # What was being done when it was ended is done again, and nothing before it.
+        assert heard[2] == heard[1] > heard[0]
+    found, expected = read(copy)["compared"], read(compared_run)["compared"]
+    for name in ("universal", "fcp"):
+        assert found[name]["by_ego"] == expected[name]["by_ego"]
+        assert found[name]["curve_returns"] == expected[name]["curve_returns"]
 
 
 @pytest.mark.slow
