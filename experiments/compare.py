@@ -32,7 +32,7 @@ from experiments.compared import STAGE, refuse_taken_names, with_compared
 from experiments.errors import UserError, as_user_error, choose, main_guard
 from experiments.progress import RunProgress
 from experiments.run_folder import RunFolder
-from experiments.summary import ORACLE, summarise
+from experiments.summary import ORACLE, return_digits, summarise
 
 NAMES = (
     *("universal", "self-play", "fcp"),
@@ -230,9 +230,11 @@ def table_of(results: dict[str, Any]) -> Table:
     table.add_column("method")
     for column in ("return", "/ Oracle"):
         table.add_column(column, justify="right")
-    for row in summarise(results):
+    rows = summarise(results)
+    digits = return_digits(row.mean for row in rows)
+    for row in rows:
         share = "" if row.method == ORACLE else f"{row.ratio:.3f}"
-        table.add_row(row.method, f"{row.mean:.1f}", share)
+        table.add_row(row.method, f"{row.mean:.{digits}f}", share)
     return table
 
 

@@ -27,7 +27,7 @@ from rich.table import Table
 from experiments import devices
 from experiments.errors import UserError, as_user_error, choose, main_guard
 from experiments.models import DEFAULT_MODEL, instructions_of, open_model
-from experiments.summary import mean, shares
+from experiments.summary import mean, return_digits, shares
 from haland_jax.pretrained import TrainedModel
 
 LARGEST_BATCH = 64
@@ -200,11 +200,13 @@ def table_of(found: dict[str, Any]) -> Table:
     ):
         table.add_column(column, justify="right")
 
+    digits = return_digits(values["return"] for values in found["styles"].values())
+
     def row(name: str, values: dict[str, Any], count: str) -> None:
         share = values["share_of_oracle"]
         shown = "–" if share is None else f"{share:.2f}"
         succeeded = [f"{values[name]:.0%}" for name in succeeds]
-        earned = f"{values['return']:.1f}"
+        earned = f"{values['return']:.{digits}f}"
         table.add_row(name, count, f"{values['accuracy']:.0%}", earned, shown, *succeeded)
 
     for style, values in found["styles"].items():

@@ -24,6 +24,7 @@ from experiments.summary import (
     mean,
     ordered_methods,
     ratios,
+    return_digits,
     returns,
     sight_shares,
     spread,
@@ -136,11 +137,12 @@ def _verdict(results: Mapping[str, Any]) -> str:
     rows = {row.method: row for row in summarise(results)}
     if HEADLINE not in rows or np.isnan(rows[HEADLINE].ratio):
         return "Haland was not measured from test sentences in this run."
-    headline = rows[HEADLINE]
+    headline, digits = rows[HEADLINE], return_digits(row.mean for row in rows.values())
     reached = "reaches the aim of" if headline.ratio >= _AIM else "misses the aim of"
     said = [
         f"From sentences never seen, Haland earns **{headline.ratio:.0%} of the Oracle** "
-        f"({_with_spread(headline.mean, headline.std)} per episode): it {reached} {_AIM:.0%}."
+        f"({_with_spread(headline.mean, headline.std, digits)} per episode): "
+        f"it {reached} {_AIM:.0%}."
     ]
     if "Best response" in rows and rows["Best response"].ratio > 0:
         ceiling = rows["Best response"].ratio
@@ -195,13 +197,15 @@ def _by_style(results: Mapping[str, Any]) -> str:
     methods = [name for name in ordered_methods(results) if name in (*METHODS, *COMPARISONS)]
     tables = {name: (returns(results, name), ratios(results, name)) for name in methods}
     bounds = results.get("upper_bounds")
+    digits = return_digits(values.mean() for values, _ in tables.values())
     rows = []
     for index, style in enumerate(results["styles"]):
         cells = []
         for method, (values, shares) in tables.items():
             share = mean(shares[index])
             of_oracle = "" if method == ORACLE or np.isnan(share) else f" ({share:.2f})"
-            cells.append(_with_spread(values[index].mean(), spread(values[index])) + of_oracle)
+            centre, deviation = values[index].mean(), spread(values[index])
+            cells.append(_with_spread(centre, deviation, digits) + of_oracle)
         if bounds:
             of_bound = tables[ORACLE][0][index].mean() / bounds[style]
             cells += [f"{bounds[style]:g}", f"{of_bound:.2f}"]
@@ -337,11 +341,12 @@ def _numbers(row: MethodSummary, rows: Sequence[MethodSummary]) -> tuple[str, ..
     success = ("–",) if row.success is None else (f"{row.success:.0%}",)
     success = success if any(other.success is not None for other in rows) else ()
     interval = "–" if row.interval is None or row.method == ORACLE else str(row.interval)
-    return _with_spread(row.mean, row.std), ratio, interval, *success, count
+    digits = return_digits(other.mean for other in rows)
+    return _with_spread(row.mean, row.std, digits), ratio, interval, *success, count
 
 
-def _with_spread(centre: float, deviation: float) -> str:
-    return f"{centre:.1f} ± {deviation:.1f}"
+def _with_spread(centre: float, deviation: float, digits: int) -> str:
+    return f"{centre:.{digits}f} ± {deviation:.{digits}f}"
 
 
 def _number(value: Any) -> str:

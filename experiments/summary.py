@@ -6,7 +6,7 @@ standard deviation over those seeds.
 """
 
 import dataclasses
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterable, Mapping, Sequence
 from typing import Any
 
 import numpy as np
@@ -149,6 +149,11 @@ def mean(values: np.ndarray) -> float:
     """The mean over the numbers that are there; NaN where there is none."""
     values = values[np.isfinite(values)]
     return float(np.mean(values)) if values.size else float("nan")
+
+
+def return_digits(values: Iterable[float]) -> int:
+    """Decimals that returns such as these are shown with: of one point at most, three."""
+    return 1 if max(map(abs, values), default=0.0) >= 10 else 3
 
 
 def summarise(results: Mapping[str, Any]) -> list[MethodSummary]:

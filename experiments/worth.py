@@ -11,6 +11,7 @@ from experiments.summary import (
     UNIVERSAL,
     UNIVERSAL_WITH_LABEL,
     MethodSummary,
+    return_digits,
     summarise,
 )
 
@@ -39,10 +40,11 @@ def _between_styles(results: Mapping[str, Any]) -> list[str]:
     values = np.asarray(results["cross_play"], float)
     own = float(np.mean(np.diag(values)))
     others = float(np.mean(values[~np.eye(len(values), dtype=bool)]))
+    digits = return_digits([own])
     kept = f", {others / own:.0%} of that" if own > 0 else ""
     return [
-        f"Best responses earn {own:.1f} with held-out partners of their own style and "
-        f"{others:.1f} with those of other styles{kept}."
+        f"Best responses earn {own:.{digits}f} with held-out partners of their own style and "
+        f"{others:.{digits}f} with those of other styles{kept}."
     ]
 
 
@@ -51,10 +53,12 @@ def _for_one_ego(results: Mapping[str, Any], rows: Mapping[str, MethodSummary]) 
         return []
     plain, told = rows[UNIVERSAL], rows[UNIVERSAL_WITH_LABEL]
     steps = results["universal"]["steps"]
+    digits = return_digits(row.mean for row in rows.values())
     said = [
         f"One feed-forward ego that learnt with the partners of all styles for "
-        f"{steps_in_words(steps)} steps earns {plain.mean:.1f} ({plain.ratio:.0%} of the Oracle) "
-        f"without the style's label and {told.mean:.1f} ({told.ratio:.0%}) with it"
+        f"{steps_in_words(steps)} steps earns {plain.mean:.{digits}f} "
+        f"({plain.ratio:.0%} of the Oracle) without the style's label and "
+        f"{told.mean:.{digits}f} ({told.ratio:.0%}) with it"
         f"{_budget(results)}."
     ]
     if np.isnan(plain.ratio) or np.isnan(told.ratio):
