@@ -117,7 +117,7 @@ def test_a_bundle_gives_back_its_model(smoke_bundle):
     assert found.haland.translator.config == model.haland.translator.config
     np.testing.assert_array_equal(found.haland.v_hat, model.haland.v_hat)
     np.testing.assert_array_equal(found.event_scale, model.event_scale)
-    for name in ("held_out_partners", "oracles"):
+    for name in ("held_out_partners", "oracles", "universal"):
         now, before = getattr(found, name), getattr(model, name)
         assert jax.tree.structure(now) == jax.tree.structure(before)
         for a, b in zip(jax.tree.leaves(now), jax.tree.leaves(before), strict=True):
@@ -170,7 +170,7 @@ def test_a_normalised_model_keeps_its_units(smoke_bundle, tmp_path):
     )
     assert float(divergence.mean()) < 0.01
     # Weights of such players may differ a hundredfold, which 8 bits a column would not keep.
-    for name in ("held_out_partners", "oracles"):
+    for name in ("held_out_partners", "oracles", "universal"):
         for a, b in zip(
             jax.tree.leaves(getattr(found, name)),
             jax.tree.leaves(getattr(model, name)),
