@@ -82,7 +82,7 @@ def measure(
     seeds: int = 2,
     added: Path | None = None,
 ) -> dict[str, Any]:
-    """Trains and judges methods, and writes results and report anew after each.
+    """Trains and judges methods; results are written after each, the report at the end.
 
     Args:
         path: folder of a finished run.
@@ -128,19 +128,21 @@ def measure(
                 updates[name] = method.num_updates(run, steps)
         # One for all methods, since it compiles the games.
         judge = Judge(run.env, config.evaluation.games, config.evaluation.batch)
-        for name, method in chosen.items():
-            stage = stages[name]
-            if folder.stage_done(stage):
-                progress.skip(stage)
-                continue
-            start = time.monotonic()
-            with progress.stage(stage, updates[name]) as task:
-                given = Given(run, _key_of(run, stage), steps, seeds, stage, task)
-                found = _measure(judge, method, name, given)
-            found = {**found, **budgets[name], "seconds": time.monotonic() - start}
-            folder.finish_stage(stage, found)
-            results = with_compared(results, folder)
-            folder.write_json("results.json", results)
+        try:
+            for name, method in chosen.items():
+                stage = stages[name]
+                if folder.stage_done(stage):
+                    progress.skip(stage)
+                    continue
+                start = time.monotonic()
+                with progress.stage(stage, updates[name]) as task:
+                    given = Given(run, _key_of(run, stage), steps, seeds, stage, task)
+                    found = _measure(judge, method, name, given)
+                found = {**found, **budgets[name], "seconds": time.monotonic() - start}
+                folder.finish_stage(stage, found)
+                results = with_compared(results, folder)
+                folder.write_json("results.json", results)
+        finally:  # also of what was measured before an interruption
             report.write_report(results, path)
     return results
 

@@ -78,7 +78,7 @@ def compilation(request):
 @pytest.fixture(scope="session")
 def smoke_run(tmp_path_factory, worker_id):
     """The folder of an uninterrupted smoke run; made once, not to be written to."""
-    from experiments import configs
+    from experiments import configs, training
     from experiments.pipeline import run_pipeline
 
     folder = tmp_path_factory.getbasetemp()
@@ -87,7 +87,9 @@ def smoke_run(tmp_path_factory, worker_id):
     path = folder / "smoke"
     with filelock.FileLock(folder / "smoke.lock"):
         if not (path / "report" / "metrics.json").exists():
-            with compiled_lightly():
+            with compiled_lightly(), pytest.MonkeyPatch.context() as patched:
+                # Pieces as in the interrupted run of test_pipeline.py, which has its programs then.
+                patched.setattr(training, "UPDATES_PER_PIECE", 4)
                 run_pipeline(configs.smoke(configs.DEFAULT_ENVIRONMENT, seed=0), path)
     return path
 
