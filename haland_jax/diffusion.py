@@ -196,7 +196,7 @@ class NoisePredictor(nn.Module):
 
 def init_network(key: Array, config: DiffusionConfig, num_events: int) -> Any:
     """Initial parameters of the noise predictor for a task language of U = `num_events`."""
-    return NoisePredictor(config).init(
+    return jax.jit(NoisePredictor(config).init)(
         key,
         jnp.zeros(config.latent_size),
         jnp.ones((), jnp.int32),

@@ -178,7 +178,8 @@ def prepare_sentences(
     """
     length = int(mask.sum(-1).max())
     token_ids, mask = jnp.asarray(token_ids[:, :length]), jnp.asarray(mask[:, :length])
-    hidden = frozen_hidden(encoder.params, encoder.architecture, config, token_ids, mask)
+    run = jax.jit(frozen_hidden, static_argnums=(1, 2))
+    hidden = run(encoder.params, encoder.architecture, config, token_ids, mask)
     return SentenceData(hidden=hidden, mask=mask, style=jnp.asarray(style, jnp.int32))
 
 

@@ -197,16 +197,19 @@ class WithoutVAE:
 def _pretrained_embedding(run: Run) -> Any:
     """Embeds sentences [B] by the encoder as it was pre-trained, float32 [B, W]."""
     encoder, tokenizer = load_pretrained(run)
-    config, styles = run.config.translator, len(run.env.style_names)
-    layers = translator.init_fine_tuning(encoder, config, styles)["encoder"]
+    architecture, config = encoder.architecture, run.config.translator
+    layers = translator.init_fine_tuning(encoder, config, len(run.env.style_names))["encoder"]
+
+    @jax.jit
+    def embed_one(params: Any, layers: Any, token_ids: jax.Array, mask: jax.Array) -> jax.Array:
+        hidden = translator.frozen_hidden(params, architecture, config, token_ids[None], mask[None])
+        return translator.embed_hidden(layers, architecture, config, hidden, mask[None])[0]
 
     def embed(sentences: list[str]) -> jax.Array:
         ids, mask = bert_weights.tokenize(tokenizer, sentences, config.maximum_length)
-        prepared = translator.prepare_sentences(
-            encoder, config, ids, mask, jnp.zeros(len(sentences), jnp.int32)
-        )
-        return translator.embed_hidden(
-            layers, encoder.architecture, config, prepared.hidden, prepared.mask
+        # One program for a sentence, however many there are.
+        return jnp.stack(
+            [embed_one(encoder.params, layers, *row) for row in zip(ids, mask, strict=True)]
         )
 
     return embed

@@ -95,13 +95,17 @@ def init_vae(run: Run, key: jax.Array, policies: Policy) -> tuple[PolicyVAE, Any
 class Visits:
     """States that policies visit in games with each partner that egos learn with.
 
-    Games are shared out over the devices; the states are for a fit, which has one.
+    Games are shared out over the devices; the states are for a fit, which has one. One program
+    draws as many states as are ever wanted at once.
     """
 
     def __init__(self, run: Run, population: Population):
         self.run = run
         self.teachers = partners.teachers(run.env, run.config.partners, population)
-        self._programs: dict[int, Any] = {}
+        wanted = run.config.compression
+        most = max(wanted.own_states, wanted.other_states, wanted.decoded_states)
+        visit = partial(partners.visited_observations, run.env, num_kept=most)
+        self._visited = over_population(visit, compiler_options=run.env.compiler_options)
 
     def own_partners(self, key: jax.Array, policies: Policy, number: int) -> jax.Array:
         """States of each policy [member] with partners of its style, [member, number, O]."""
@@ -113,14 +117,11 @@ class Visits:
 
     def _visit(self, key: jax.Array, policies: Policy, number: int, shift: int) -> jax.Array:
         env, times = self.run.env, self.run.config.partners.train_seeds
-        if number not in self._programs:
-            visit = partial(partners.visited_observations, env, num_kept=number)
-            self._programs[number] = over_population(visit, compiler_options=env.compiler_options)
         others = _for_each_policy(self.teachers, times, shift)
         styles = _for_each_policy(env.styles, times, shift)
         keys = jax.random.split(key, len(env.style_names) * times)
-        states = self._programs[number](keys, policies, others, styles)
-        return jax.device_put(states, jax.devices()[0])
+        states = self._visited(keys, policies, others, styles)
+        return jax.device_put(states[:, :number], jax.devices()[0])
 
 
 @partial(jax.jit, static_argnums=(1, 2))
