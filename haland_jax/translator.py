@@ -178,8 +178,8 @@ def prepare_sentences(
     """
     length = int(mask.sum(-1).max())
     token_ids, mask = jnp.asarray(token_ids[:, :length]), jnp.asarray(mask[:, :length])
-    run = jax.jit(frozen_hidden, static_argnums=(1, 2))
-    hidden = run(encoder.params, encoder.architecture, config, token_ids, mask)
+    frozen = jax.jit(frozen_hidden, static_argnums=(1, 2))
+    hidden = frozen(encoder.params, encoder.architecture, config, token_ids, mask)
     return SentenceData(hidden=hidden, mask=mask, style=jnp.asarray(style, jnp.int32))
 
 
@@ -373,8 +373,7 @@ def translate(
     variables = {"params": params["encoder"]}
     hidden = frozen_hidden(variables, architecture, config, token_ids, mask)
     embedding = embed_hidden(params["encoder"], architecture, config, hidden, mask)
-    num_events = params["vae"]["frequencies"]["bias"].shape[0]
-    vae: Any = _vae(config, num_events)
+    vae: Any = _vae(config, num_events=params["vae"]["frequencies"]["bias"].shape[0])
     translated = vae.apply({"params": params["vae"]}, embedding)
     return translated, classify(params["classifier"], embedding, config)
 
