@@ -28,16 +28,11 @@ from rich.console import Console
 from rich.table import Table
 
 from experiments import devices
-from experiments.compared import STAGE, refuse_taken_names, with_compared
+from experiments.compared import NAMES, STAGE, refuse_taken_names, with_compared
 from experiments.errors import UserError, as_user_error, choose, main_guard
 from experiments.progress import RunProgress
 from experiments.run_folder import RunFolder
 from experiments.summary import ORACLE, return_digits, summarise
-
-NAMES = (
-    *("universal", "self-play", "fcp"),
-    *("cgan-mlp", "cgan-unet", "no-translator", "no-vae", "no-fine-tuning"),
-)
 
 
 @dataclasses.dataclass(frozen=True)

@@ -6,6 +6,11 @@ from experiments.errors import UserError
 from experiments.run_folder import RunFolder
 from experiments.summary import COMPARISONS, METHODS
 
+NAMES = (
+    *("universal", "self-play", "fcp"),
+    *("cgan-mlp", "cgan-unet", "no-translator", "no-vae", "no-fine-tuning"),
+)
+"""The methods that come with the project."""
 COMPARED = "compared"
 """Where results.json says what the methods were trained with."""
 STAGE = "method_"

@@ -6,6 +6,7 @@ from typing import Any
 
 import numpy as np
 
+from experiments.compared import COMPARED, NAMES
 from experiments.intervals import Estimate
 from experiments.standing import Standing, best_ego, standings
 from experiments.summary import (
@@ -62,6 +63,8 @@ class Overview:
         shares: by method that is compared with others, the interquartile mean of return / Oracle
             with its interval; Haland's first.
         best_ego: the universal ego that earns most beside Haland; None where none was measured.
+        compared: which of the project's other methods `experiments.compare` measured.
+        compared_seeds: how many egos of each kind it trained; None where it trained none.
     """
 
     environment: str
@@ -92,6 +95,8 @@ class Overview:
     date: str | None
     shares: Mapping[str, Estimate]
     best_ego: Standing | None
+    compared: tuple[str, ...]
+    compared_seeds: int | None
 
     def amount(self, value: float | None) -> str:
         """A return of this environment for a reader; a dash for what was not measured."""
@@ -121,6 +126,7 @@ def overview(results: Mapping[str, Any]) -> Overview:
     machine = results.get("machine", {})
     rows = {row.method: row for row in summarise(results)}
     times, gates = results.get("times"), results.get("gates", {})
+    compared = results.get(COMPARED, {})
     return Overview(
         environment=results["environment"],
         preset=results["preset"],
@@ -152,6 +158,8 @@ def overview(results: Mapping[str, Any]) -> Overview:
         date=machine.get("date"),
         shares=_shares(results),
         best_ego=best_ego(results),
+        compared=tuple(name for name in NAMES if name in compared),
+        compared_seeds=next((one["seeds"] for one in compared.values() if "seeds" in one), None),
     )
 
 

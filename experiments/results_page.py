@@ -5,7 +5,7 @@ from collections.abc import Callable, Sequence
 import envs
 from experiments.markdown import table
 from experiments.overview import Overview, number, percent
-from experiments.run_all import ALL
+from experiments.run_all import ALL, default_path
 from experiments.standing import Standing
 from experiments.worth import steps_in_words
 
@@ -258,7 +258,7 @@ def _success(shares: tuple[float, float] | None) -> str:
 
 
 def _commands(overviews: Sequence[Overview]) -> list[str]:
-    """The commands that make the runs and record them, one for each preset and seed."""
+    """The commands that make the runs, compare other methods in them, and record them."""
     made, recorded = [], []
     for preset, seed in dict.fromkeys((row.preset, row.seed) for row in overviews):
         names = [r.environment for r in overviews if (r.preset, r.seed) == (preset, seed)]
@@ -266,4 +266,15 @@ def _commands(overviews: Sequence[Overview]) -> list[str]:
         with_seed = f" --seed {seed}" if seed else ""
         made.append(f"uv run python -m experiments.run --env {asked} --preset {preset}{with_seed}")
         recorded.append(f"runs/*-{preset}-{seed}")
-    return [*made, f"uv run python -m experiments.record {' '.join(recorded)}"]
+    compared = [_comparison(row) for row in overviews if row.compared]
+    return [*made, *compared, f"uv run python -m experiments.record {' '.join(recorded)}"]
+
+
+def _comparison(row: Overview) -> str:
+    """The command that measured other methods in a run."""
+    run = default_path(row.environment, row.preset, row.seed)
+    seeds = "" if row.compared_seeds is None else f" --seeds {row.compared_seeds}"
+    return (
+        f"uv run python -m experiments.compare {run.as_posix()}{seeds} "
+        f"--methods {' '.join(row.compared)}"
+    )

@@ -160,6 +160,17 @@ def test_the_page_has_the_commands_every_column_and_the_remarks():
     assert "## Remarks" not in results_page.page(two, "")
 
 
+def test_the_page_has_the_commands_that_compared_other_methods():
+    nothing: dict = {"by_ego": {}}
+    compared = {"no-vae": nothing, "of-ones-own": nothing, "universal": {**nothing, "seeds": 3}}
+    rows = [overview(small_results(compared=compared)), overview(small_results(environment=OTHER))]
+    page = results_page.page(rows, "")
+    run = f"runs/{KITCHEN.replace('/', '-')}-overnight-0"
+    command = f"uv run python -m experiments.compare {run} --seeds 3 --methods universal no-vae\n"
+    assert command in page
+    assert page.count("experiments.compare") == 1
+
+
 def picture(path: Path, size: tuple[int, int] = (60, 40)) -> None:
     path.parent.mkdir(parents=True, exist_ok=True)
     noise = np.random.default_rng(0).integers(0, 256, (size[1], size[0], 3), np.uint8)
