@@ -11,8 +11,9 @@ from rich.table import Table
 import envs
 from experiments.configs import PRESETS
 from experiments.methods.universal import recurrent_config
+from experiments.training import in_turns
 from haland_jax import partners, recurrent_ppo
-from haland_jax.population import share_out
+from haland_jax.population import share_out, turns
 from haland_jax.ppo_loss import PPOConfig
 from haland_jax.recurrent_egos import VARIANTS
 
@@ -74,9 +75,11 @@ def measure_recurrent(
     others = partners.unflatten(partners.trained_players(pairs).partner.actor, len(env.style_names))
     state = recurrent_ppo.init_recurrent(env, training, jax.random.key(1), others, 1)
     train = recurrent_ppo.compile_recurrent(env, training, updates)
-    steps = len(VARIANTS) * updates * training.steps_per_update
+    groups = turns(len(VARIANTS), len(jax.devices()))
+    steps = sum(map(len, groups)) * updates * training.steps_per_update
     what = f"{', '.join(VARIANTS)}, {training.num_envs} games each"
-    return _described(environment, what, _measure(train, state, steps, repeats), RECURRENT_BAR)
+    found = _measure(lambda state: in_turns(train, groups, state, ()), state, steps, repeats)
+    return _described(environment, what, found, RECURRENT_BAR)
 
 
 def _measure(

@@ -7,7 +7,7 @@ from experiments.run_folder import RunFolder
 from experiments.summary import COMPARISONS, METHODS
 
 NAMES = (
-    *("universal", "self-play", "fcp"),
+    *("universal", "universal-mlp", "self-play", "fcp"),
     *("cgan-mlp", "cgan-unet", "no-translator", "no-vae", "no-fine-tuning"),
 )
 """The methods that come with the project."""

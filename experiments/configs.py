@@ -26,6 +26,7 @@ class Adaptation:
         joint: settings of the joint training that differ.
         refit: settings of the best responses' refits that differ.
         partners: settings of the partners and best responses that differ.
+        joint_steps: steps of the joint training by preset, in place of `length`.
         refit_steps: steps of the refits by preset, where the preset's are too few.
         compression: the policy VAE's fit by preset, where the preset's is too short.
         universal_games: games in parallel of the universal egos by preset, where those of the
@@ -40,6 +41,7 @@ class Adaptation:
     joint: Mapping[str, Any] = dataclasses.field(default_factory=dict)
     refit: Mapping[str, Any] = dataclasses.field(default_factory=dict)
     partners: Mapping[str, Any] = dataclasses.field(default_factory=dict)
+    joint_steps: Mapping[str, int] = dataclasses.field(default_factory=dict)
     refit_steps: Mapping[str, int] = dataclasses.field(default_factory=dict)
     compression: Mapping[str, FitConfig] = dataclasses.field(default_factory=dict)
     universal_games: Mapping[str, int] = dataclasses.field(default_factory=dict)
@@ -53,9 +55,11 @@ ADAPTATIONS = {
     # Both players must learn to give way.
     "overcooked/crossway": Adaptation(length=1.7),
     # Pairs must learn to share the work in two rooms, and otherwise keep to the nearer pot: the
-    # farther one pays some fifty steps after the first ingredient is put into it.
+    # farther one pays some fifty steps after the first ingredient is put into it. `quick` has
+    # fewer steps and is content with the nearer pot.
     "overcooked/diverse_orders": Adaptation(
         length=4.0,
+        joint_steps={"quick": 1_800_000},
         refit_length=2.0,
         joint={"entropy": 0.04, "final_entropy": 0.005},
         training={"discount": 0.995},
@@ -188,6 +192,9 @@ def _adapted(config: RunConfig) -> RunConfig:
     partners, universal, compression = config.partners, config.universal, config.compression
     steps = change.refit_steps.get(config.preset, partners.refit.total_steps)
     refit = dataclasses.replace(partners.refit, total_steps=steps)
+    joint = changed(partners.joint, change.length, **change.joint)
+    steps = change.joint_steps.get(config.preset, joint.total_steps)
+    joint = dataclasses.replace(joint, total_steps=steps)
     normalised = change.training.get("normalise", compression.vae.normalised)
     games = change.universal_games.get(config.preset, universal.training.num_envs)
     return dataclasses.replace(
@@ -195,7 +202,7 @@ def _adapted(config: RunConfig) -> RunConfig:
         max_steps=min(config.max_steps, change.max_steps),
         partners=dataclasses.replace(
             partners,
-            joint=changed(partners.joint, change.length, **change.joint),
+            joint=joint,
             refit=changed(refit, change.refit_length, **change.refit),
             oracle=changed(partners.oracle),
             **change.partners,

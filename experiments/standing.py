@@ -18,7 +18,13 @@ from experiments.summary import (
 )
 
 ADAPTIVE = "Adaptive Ego"
-EGOS = ("General Ego", "Instructed Ego", ADAPTIVE, "Self-play", "FCP", *COMPARISONS)
+WITHOUT_MEMORY = ("General Ego (MLP)", "Instructed Ego (MLP)")
+"""The egos of `COMPARISONS`, trained for longer."""
+EGOS = (
+    *("General Ego", "Instructed Ego", ADAPTIVE),
+    *WITHOUT_MEMORY,
+    *("Self-play", "FCP", *COMPARISONS),
+)
 """Universal egos; further methods that no run of ours knows follow them."""
 ABLATIONS = ("CGAN (MLP)", "CGAN (UNet)", "Without translator", "Without VAE")
 """The columns of Table 1 after Oracle and Haland."""
@@ -55,9 +61,17 @@ class Standing(NamedTuple):
 def compared(runs: Iterable[Results]) -> list[str]:
     """The methods of Fig. 3: Haland, the universal egos, then any others that are not ours."""
     found = dict.fromkeys(name for run in runs for name in ordered_methods(run))
-    egos = [name for name in EGOS if name in found]
+    egos = universal_egos(found)
     others = [name for name in found if name not in (HEADLINE, *_OWN, *ABLATIONS, *EGOS)]
     return [HEADLINE, *egos, *others]
+
+
+def universal_egos(measured: Iterable[str]) -> list[str]:
+    """The universal egos among methods; of the same kind, only those that learnt longest."""
+    found = set(measured)
+    if found.issuperset(WITHOUT_MEMORY):
+        found.difference_update(COMPARISONS)
+    return [name for name in EGOS if name in found]
 
 
 def estimates(runs: Sequence[Results], method: str) -> Estimate | None:
@@ -106,7 +120,7 @@ def improvement(runs: Sequence[Results]) -> dict[str, float]:
     """
     best, each = [], []
     for run in runs:
-        others = [name for name in EGOS if name in run["methods"]]
+        others = universal_egos(run["methods"])
         if not others:
             continue
         ours = returns(run, HEADLINE).mean()

@@ -17,11 +17,13 @@ from experiments.progress import StageProgress
 from haland_jax import checkpoint, fit, partners
 from haland_jax.fit import FitConfig, FitState
 from haland_jax.learner import TrainState
-from haland_jax.population import share_out
+from haland_jax.population import share_out, turns
 from haland_jax.ppo import PPOConfig
 
 SECONDS_BETWEEN_CHECKPOINTS = 20.0
 UPDATES_PER_PIECE = 25
+Program = Callable[..., tuple[Any, dict[str, jax.Array]]]
+"""Does some updates of a population: state, and whatever else it takes -> state, metrics."""
 
 
 class Saver:
@@ -74,19 +76,14 @@ def train_population(
     Raises:
         NonFiniteLoss: training diverged.
     """
-    styles = share_out(styles)
-
-    def compiled(updates: int) -> Callable[[TrainState], tuple[TrainState, dict[str, jax.Array]]]:
-        train = partners.compile_training(env, config, updates)
-        return lambda state: train(state, styles)
-
     state, returns = train_in_pieces(
         config,
         start(),
-        compiled,
+        lambda updates: partners.compile_training(env, config, updates),
         saver,
         report,
         stage,
+        by_member=(share_out(styles),),
         updates_per_piece=updates_per_piece,
         between=between,
     )
@@ -96,11 +93,12 @@ def train_population(
 def train_in_pieces(
     config: PPOConfig,
     state: Any,
-    compiled: Callable[[int], Callable[[Any], tuple[Any, dict[str, jax.Array]]]],
+    compiled: Callable[[int], Program],
     saver: Saver,
     report: Callable[[int, dict[str, float]], None],
     stage: str,
     *,
+    by_member: tuple[Any, ...] = (),
     updates_per_piece: int | None = None,
     between: Callable[[Any], Any] | None = None,
 ) -> tuple[Any, np.ndarray]:
@@ -109,11 +107,13 @@ def train_in_pieces(
     Args:
         config: settings; `config.num_updates` is the length.
         state: the initial states, leading axis [member], with the updates done in `update`.
-        compiled: makes the program that does some updates: state -> state, metrics.
+        compiled: makes the program that does some updates: state, *by_member -> state, metrics.
         saver: where interrupted training goes on from.
         report: called with the updates done and the mean return.
         stage: for messages.
-        updates_per_piece: updates of each compiled piece; `UPDATES_PER_PIECE` by default.
+        by_member: whatever else the program takes, leading axis [member].
+        updates_per_piece: updates of each member in a piece; `UPDATES_PER_PIECE` by default. Where
+            members take turns (`population.turns`), it is rounded down to whole rounds of them.
         between: what happens to the state between two pieces, if anything.
 
     Returns:
@@ -128,14 +128,19 @@ def train_in_pieces(
     if saved is not None:
         state, returns = saved["state"], np.array(saved["returns"])
     state = share_out(state)
-    programs: dict[int, Callable[[Any], tuple[Any, dict[str, jax.Array]]]] = {}
+    groups = turns(members, len(jax.devices()))
+    rounds = sum(len(group) for group in groups) // members
+    programs: dict[int, Program] = {}
     done = int(np.asarray(state.update)[0])
     while done < config.num_updates:
         size = min(updates_per_piece or UPDATES_PER_PIECE, config.num_updates - done)
-        if size not in programs:
-            programs[size] = compiled(size)
-        state, metrics = programs[size](state)
-        metrics = {name: np.asarray(values).T for name, values in metrics.items()}
+        # What is less than a round at the end is done by all members at once.
+        taken, each = (groups, rounds) if size >= rounds else ([np.arange(members)], 1)
+        size -= size % each
+        if size // each not in programs:
+            programs[size // each] = compiled(size // each)
+        state, metrics = in_turns(programs[size // each], taken, state, by_member)
+        metrics = {name: values.T for name, values in metrics.items()}
         fit.check_finite(stage, done, metrics)
         returns[done : done + size] = metrics["return"]
         done += size
@@ -144,6 +149,38 @@ def train_in_pieces(
             state = share_out(between(state))
         saver.save_if_due({"state": state, "returns": returns})
     return state, returns
+
+
+def in_turns(
+    program: Program, groups: list[np.ndarray], state: Any, by_member: tuple[Any, ...]
+) -> tuple[Any, dict[str, np.ndarray]]:
+    """Lets groups of members compute one after the other; metrics are [member, update]."""
+    if len(groups) == 1:
+        state, metrics = program(state, *by_member)
+        return state, {name: np.asarray(values) for name, values in metrics.items()}
+    found: list[list[dict[str, np.ndarray]]] = [[] for _ in range(len(state.update))]
+    device = jax.devices()[0]  # whoever waits for a turn, waits here
+    state, by_member = jax.device_put((state, by_member), device)
+    for group in groups:
+        after, metrics = program(*_members_of((state, *by_member), group))
+        metrics = {name: np.asarray(values) for name, values in metrics.items()}
+        for place, member in enumerate(group):
+            found[member].append({name: values[place] for name, values in metrics.items()})
+        state = _with_members(state, jax.device_put(after, device), group)
+    return state, {
+        name: np.array([np.concatenate([part[name] for part in parts]) for parts in found])
+        for name in found[0][0]
+    }
+
+
+@jax.jit
+def _members_of(population: Any, group: Any) -> Any:
+    return jax.tree.map(lambda leaf: leaf[group], population)
+
+
+@jax.jit
+def _with_members(population: Any, members: Any, group: Any) -> Any:
+    return jax.tree.map(lambda whole, part: whole.at[group].set(part), population, members)
 
 
 def run_fit(

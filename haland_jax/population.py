@@ -5,6 +5,7 @@ devices (`jax.config.update("jax_num_cpu_devices", 2)` before the first computat
 population is shared out over them; the same code runs on several GPUs.
 """
 
+import math
 from collections.abc import Callable
 from typing import Any
 
@@ -75,10 +76,30 @@ def over_population(
         if any(isinstance(leaf, Tracer) for leaf in jax.tree.leaves(arguments)):
             return call(*arguments)  # a part of another program, which has its own options
         common, own = arguments[:shared], arguments[shared:]
-        common = jax.device_put(common, NamedSharding(mesh, PartitionSpec()))
+        undivided = NamedSharding(mesh, PartitionSpec())
+        common = jax.device_put(common, undivided)
+        if population_size(own) % len(devices):
+            return compiled(*common, *jax.device_put(own, undivided))
         return compiled(*common, *map(share_out, own))
 
     return placed
+
+
+def turns(members: int, devices: int) -> list[np.ndarray]:
+    """Who computes together, so that no device waits for a population that devices do not divide.
+
+    Three members on two devices take turns as (0, 1), (2, 0), (1, 2): after all groups each has had
+    as many turns as any other, and no device computed a copy of a member.
+
+    Returns:
+        Members of each group, int [member of the group]; one group of all where the devices
+        divide the population, or are more than its members.
+    """
+    size = members - members % devices
+    if size in (0, members):
+        return [np.arange(members)]
+    groups = members // math.gcd(members, size)
+    return [np.arange(first, first + size) % members for first in range(0, groups * size, size)]
 
 
 def share_out(population: Population) -> Population:

@@ -74,6 +74,7 @@ def test_all_methods_are_measured_beside_haland(smoke_run, compared_run):
     assert results == before, "nothing else has changed"
     assert set(added) == {
         *("General Ego", "Instructed Ego", "Adaptive Ego", "FCP"),
+        *("General Ego (MLP)", "Instructed Ego (MLP)"),
         *("CGAN (MLP)", "Without translator", "Without VAE"),
         *("Without fine-tuning", "Retrieval"),
     }
@@ -92,7 +93,7 @@ def test_all_methods_are_measured_beside_haland(smoke_run, compared_run):
         np.testing.assert_allclose(by_ego.mean(axis=1), found.mean(axis=1), rtol=1e-5)
         assert f"| {name} |" in report
         assert descriptions[name] in report
-    for name in ("universal", "fcp"):
+    for name in ("universal", "universal-mlp", "fcp"):
         assert 0 < trained[name]["steps"] <= 1.5 * STEPS
         for curve in trained[name]["curve_returns"].values():
             assert np.shape(curve) == (2, len(trained[name]["curve_steps"]))

@@ -5,7 +5,7 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 
-from haland_jax.population import over_population, population_size, share_out
+from haland_jax.population import over_population, population_size, share_out, turns
 
 
 def one_member(key, member):
@@ -57,6 +57,21 @@ def test_the_work_is_shared_out():
 def test_what_devices_do_not_divide_is_left_where_it_is():
     population = some(3)[1]
     assert share_out(population) is population
+
+
+@pytest.mark.parametrize(("members", "devices"), [(1, 2), (4, 2), (3, 2), (5, 2), (9, 6), (3, 8)])
+def test_turns_are_fair_and_devices_share_each_group(members, devices):
+    groups = turns(members, devices)
+    taken = np.bincount(np.concatenate(groups), minlength=members)
+    assert len(taken) == members
+    assert set(taken) == {taken[0]}
+    for group in groups:
+        assert len(set(group)) == len(group)
+        assert len(group) % devices == 0 or len(groups) == 1
+
+
+def test_three_members_on_two_devices():
+    assert [group.tolist() for group in turns(3, 2)] == [[0, 1], [2, 0], [1, 2]]
 
 
 def test_donated_arguments_are_consumed_and_others_are_not():

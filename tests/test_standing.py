@@ -7,7 +7,7 @@ from made_up_results import made_up_results
 from experiments import report, results_page, standing
 from experiments.intervals import Estimate
 from experiments.overview import overview
-from experiments.summary import HEADLINE, UNIVERSAL
+from experiments.summary import HEADLINE, UNIVERSAL, UNIVERSAL_WITH_LABEL
 
 
 def measured(**shares: float) -> dict:
@@ -47,6 +47,12 @@ def test_steps_are_held_against_those_of_all_best_responses():
     assert best is not None
     assert best.method == UNIVERSAL, "ablations and others are no universal egos"
     assert best.verdict == "behind"
+
+
+def test_of_egos_of_the_same_kind_those_that_learnt_longest_count():
+    shorter, longer = (UNIVERSAL, UNIVERSAL_WITH_LABEL), standing.WITHOUT_MEMORY
+    assert standing.universal_egos(["FCP", *shorter, longer[0]]) == [longer[0], "FCP", *shorter]
+    assert standing.universal_egos(["FCP", *shorter, *longer]) == [*longer, "FCP"]
 
 
 def test_nothing_to_compare():

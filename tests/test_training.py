@@ -2,14 +2,18 @@
 
 import dataclasses
 import math
+from functools import partial
 
 import jax
+import jax.numpy as jnp
 import numpy as np
 import pytest
+from flax.struct import PyTreeNode
 from toy_game import ToyGame
 
 from experiments import training
 from haland_jax import partners
+from haland_jax.population import over_population
 from haland_jax.ppo import PPOConfig
 
 CONFIG = PPOConfig(total_steps=80, num_envs=4, rollout_steps=5, num_minibatches=2, epochs=1)
@@ -66,6 +70,68 @@ def test_a_population_goes_on_where_it_was_and_ends_alike(monkeypatch, tmp_path)
     *resumed, reported = train(tmp_path / "resumed", updates_per_piece=2)
     assert reported == [4], "the piece after the last checkpoint is done again, no other"
     assert_alike(resumed, whole)
+
+
+class Counter(PyTreeNode):
+    """A state that adds up what its own key draws."""
+
+    update: jax.Array
+    key: jax.Array
+    total: jax.Array
+
+
+def count(updates: int, state: Counter, weight: jax.Array):
+    def one(state, _):
+        drawn = weight * jax.random.uniform(jax.random.fold_in(state.key, state.update))
+        state = state.replace(update=state.update + 1, total=state.total + drawn)
+        return state, {"return": state.total, "loss": drawn}
+
+    return jax.lax.scan(one, state, length=updates)
+
+
+@pytest.mark.parametrize("members", [2, 3, 5])
+def test_members_that_take_turns_end_as_they_would_side_by_side(tmp_path, members):
+    """Five members take turns in groups of four, each of them four times in a round."""
+    config, sizes = dataclasses.replace(CONFIG, total_steps=11 * CONFIG.steps_per_update), []
+
+    def compiled(updates):
+        program = over_population(partial(count, updates), donate=(0,))
+
+        def noted(state, weights):
+            sizes.append((len(weights), updates))
+            return program(state, weights)
+
+        return noted
+
+    weights = jnp.arange(1.0, members + 1)
+    keys = jax.random.split(jax.random.key(3), members)
+    state, returns = training.train_in_pieces(
+        config,
+        Counter(jnp.zeros(members, jnp.int32), keys, jnp.zeros(members)),
+        compiled,
+        training.Saver(tmp_path),
+        lambda done, metrics: None,
+        "counting",
+        by_member=(weights,),
+        updates_per_piece=6,
+    )
+    drawn = np.array(
+        [
+            [jax.random.uniform(jax.random.fold_in(key, update)) for update in range(11)]
+            for key in keys
+        ]
+    )
+    np.testing.assert_allclose(returns, np.cumsum(weights[:, None] * drawn, axis=1).T, rtol=1e-5)
+    np.testing.assert_allclose(state.total, returns[-1], rtol=1e-6)
+    assert state.update.tolist() == [11] * members
+    assert (
+        sizes
+        == {
+            2: [(2, 6), (2, 5)],
+            3: [(2, 3)] * 3 + [(2, 2)] * 3 + [(3, 1)],
+            5: [(4, 1)] * 5 + [(4, 1)] * 5 + [(5, 3)],
+        }[members]
+    )
 
 
 def test_pairs_that_change_partners_go_on_with_the_partners_they_had(monkeypatch, tmp_path):

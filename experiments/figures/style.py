@@ -39,6 +39,8 @@ FILLS = {
     "General Ego": ("#e8b96a", ""),
     "Instructed Ego": ("#b5651d", ""),
     "Adaptive Ego": ("#f6e3c0", ".."),
+    "General Ego (MLP)": ("#c9d8c0", "xx"),
+    "Instructed Ego (MLP)": ("#6f8f6b", "//"),
     "Self-play": ("#dccfe6", ""),
     "FCP": ("#8d6fa6", ""),
     "CGAN (MLP)": ("#cfe8e6", ""),

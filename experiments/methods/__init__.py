@@ -7,10 +7,11 @@ from experiments.methods.base import Told as Told
 from experiments.methods.base import Trained as Trained
 from experiments.methods.fine_tuning import WithoutFineTuning
 from experiments.methods.self_play import FictitiousCoPlay, SelfPlay
-from experiments.methods.universal import RecurrentEgos
+from experiments.methods.universal import FeedForwardEgos, RecurrentEgos
 
 BASELINES: dict[str, Method] = {
     "universal": RecurrentEgos(),
+    "universal-mlp": FeedForwardEgos(),
     "self-play": SelfPlay(),
     "fcp": FictitiousCoPlay(),
 }

@@ -7,7 +7,7 @@ import jax
 import jax.numpy as jnp
 
 from experiments.methods.base import Given, MakeEgo, Told, Trained
-from experiments.methods.universal import curve_points, smooth
+from experiments.methods.universal import curves_of
 from experiments.stages import Run
 from experiments.training import train_population
 from experiments.worth import steps_in_words
@@ -63,7 +63,6 @@ class SelfPlay:
             "self-play",
         )
         steps = training.num_updates * training.steps_per_update
-        points = curve_points(len(returns))
         given.keep(players.ego.actor)
         return Trained(
             egos={SELF_PLAY: _in_turn(players.ego.actor, given.seeds)},
@@ -72,10 +71,7 @@ class SelfPlay:
                 f"{steps_in_words(steps)} steps"
             },
             steps=steps,
-            notes={
-                "curve_steps": points[1:] * training.steps_per_update,
-                "curve_returns": {SELF_PLAY: smooth(returns, points)},
-            },
+            notes=curves_of(training, (SELF_PLAY,), returns),
         )
 
 
@@ -109,7 +105,6 @@ class FictitiousCoPlay:
         )
         ego_steps = ego_config.num_updates * ego_config.steps_per_update
         steps = ego_steps + POOL * first * pool_config.steps_per_update
-        points = curve_points(len(returns))
         given.keep(players.ego.actor)
         return Trained(
             egos={FCP: _in_turn(players.ego.actor, given.seeds)},
@@ -118,10 +113,7 @@ class FictitiousCoPlay:
                 f"learning, all styles, {steps_in_words(steps)} steps with theirs"
             },
             steps=steps,
-            notes={
-                "curve_steps": points[1:] * ego_config.steps_per_update,
-                "curve_returns": {FCP: smooth(returns, points)},
-            },
+            notes=curves_of(ego_config, (FCP,), returns),
         )
 
     def _configs(self, run: Run, steps: int) -> tuple[PPOConfig, PPOConfig]:

@@ -1,4 +1,8 @@
-"""The paper's universal egos with a memory: General, Instructed and Adaptive Ego (App. C.3)."""
+"""Universal egos: the paper's, with a memory (App. C.3), and the same without one.
+
+The paper's General, Instructed and Adaptive Ego remember; with as many steps they take ten times as
+long as egos without a memory, some of which earn more.
+"""
 
 import dataclasses
 import itertools
@@ -6,15 +10,20 @@ import itertools
 import jax
 import numpy as np
 
+from envs.labelled import Labelled
 from experiments.configs import RunConfig
 from experiments.methods.base import Given, MakeEgo, Told, Trained
 from experiments.stages import Run
-from experiments.training import train_in_pieces
+from experiments.training import train_in_pieces, train_population
 from experiments.worth import steps_in_words
-from haland_jax import recurrent_ppo
+from haland_jax import recurrent_ppo, universal
+from haland_jax.networks import Policy
 from haland_jax.ppo_loss import PPOConfig
 from haland_jax.recurrent_egos import ADAPTIVE, GENERAL, INSTRUCTED, VARIANTS, UniversalEgo
+from haland_jax.rollout import Agent
+from haland_jax.universal import TOLD_NOTHING, TOLD_THE_STYLE
 
+GENERAL_MLP, INSTRUCTED_MLP = f"{GENERAL} (MLP)", f"{INSTRUCTED} (MLP)"
 CURVE_POINTS = 40
 KNOWS = {
     GENERAL: "told nothing",
@@ -43,7 +52,7 @@ def recurrent_config(config: RunConfig, steps: int) -> PPOConfig:
 
 
 class RecurrentEgos:
-    """All three of them, which learn in one program."""
+    """The three with a memory, which learn in one program."""
 
     budgeted = True
 
@@ -67,19 +76,74 @@ class RecurrentEgos:
         egos = recurrent_ppo.egos_by_style(env, actors)
         steps = training.num_updates * training.steps_per_update
         what = "one ego with a memory for all styles, {}, " + f"{steps_in_words(steps)} steps"
-        points = curve_points(len(returns))
         return Trained(
-            egos={name: _in_turn(agents, given.seeds) for name, agents in egos.items()},
+            egos={name: in_turn(agents, given.seeds) for name, agents in egos.items()},
             descriptions={name: what.format(knows) for name, knows in KNOWS.items()},
             steps=steps,
-            notes={
-                "curve_steps": points[1:] * training.steps_per_update,
-                "curve_returns": {
-                    name: smooth(returns, points)[index * given.seeds : (index + 1) * given.seeds]
-                    for index, name in enumerate(VARIANTS)
-                },
-            },
+            notes=curves_of(training, VARIANTS, returns),
         )
+
+
+class FeedForwardEgos:
+    """A General and an Instructed Ego without a memory: the run's universal egos, for longer."""
+
+    budgeted = True
+
+    def num_updates(self, run: Run, steps: int) -> int:
+        """Updates of each."""
+        return self._training(run.config, steps).num_updates
+
+    def train(self, given: Given) -> Trained:
+        """Trains them by PPO with the partners of all styles together."""
+        env, training = Labelled(given.env), self._training(given.run.config, given.steps)
+        config = dataclasses.replace(
+            given.run.config.universal, seeds=given.seeds, training=training
+        )
+        players, returns = train_population(
+            env,
+            training,
+            lambda: universal.init_universal(env, config, given.key, given.partners),
+            universal.member_styles(env, given.seeds),
+            given.saver(f"{training.num_updates}_updates_{given.seeds}_seeds"),
+            given.task.update,
+            "universal egos without a memory",
+        )
+        given.keep(players.ego)
+        by_variant = universal.players_by_style(env, players.ego)
+        egos = {
+            GENERAL_MLP: by_variant[TOLD_NOTHING].actor,
+            INSTRUCTED_MLP: by_variant[TOLD_THE_STYLE].actor,
+        }
+        steps = training.num_updates * training.steps_per_update
+        what = "one ego without a memory for all styles, {}, " + f"{steps_in_words(steps)} steps"
+        told = {GENERAL_MLP: KNOWS[GENERAL], INSTRUCTED_MLP: KNOWS[INSTRUCTED]}
+        return Trained(
+            egos={name: in_turn(actors, given.seeds) for name, actors in egos.items()},
+            descriptions={name: what.format(knows) for name, knows in told.items()},
+            steps=steps,
+            notes=curves_of(training, tuple(told), returns),
+        )
+
+    def _training(self, config: RunConfig, steps: int) -> PPOConfig:
+        return dataclasses.replace(config.universal.training, total_steps=steps)
+
+
+def curves_of(
+    training: PPOConfig, names: tuple[str, ...], returns: np.ndarray
+) -> dict[str, np.ndarray | dict[str, np.ndarray]]:
+    """Learning curves for results.json.
+
+    Args:
+        training: how the egos learnt.
+        names: of the kinds of egos.
+        returns: of the training games, [update, kind * seed].
+    """
+    points = curve_points(len(returns))
+    curves = np.split(smooth(returns, points), len(names))
+    return {
+        "curve_steps": points[1:] * training.steps_per_update,
+        "curve_returns": dict(zip(names, curves, strict=True)),
+    }
 
 
 def curve_points(updates: int) -> np.ndarray:
@@ -92,11 +156,11 @@ def smooth(returns: np.ndarray, points: np.ndarray) -> np.ndarray:
     return np.array([returns[a:b].mean(axis=0) for a, b in itertools.pairwise(points)]).T
 
 
-def _in_turn(agents: UniversalEgo, seeds: int) -> MakeEgo:
+def in_turn(egos: Policy | UniversalEgo, seeds: int) -> MakeEgo:
     """Gives trained egos, leading axes [style, seed], one after the other."""
 
-    def make(told: Told, key: jax.Array) -> UniversalEgo:
+    def make(told: Told, key: jax.Array) -> Policy | Agent:
         del key
-        return jax.tree.map(lambda leaf: leaf[told.style, told.number % seeds], agents)
+        return jax.tree.map(lambda leaf: leaf[told.style, told.number % seeds], egos)
 
     return make
