@@ -8,7 +8,7 @@ import numpy as np
 
 from experiments.compared import COMPARED, NAMES
 from experiments.intervals import Estimate
-from experiments.standing import Standing, best_ego, standings
+from experiments.standing import Gain, Standing, best_ego, gain, standings
 from experiments.summary import (
     BEST_RESPONSE,
     HEADLINE,
@@ -62,6 +62,9 @@ class Overview:
         date: day of the run, year-month-day.
         shares: by method that is compared with others, the interquartile mean of return / Oracle
             with its interval; Haland's first.
+        steps: by method whose egos learnt in games, environment steps of one of them and their
+            share of the steps of all best responses together, where that is known.
+        gain: how much more Haland earns than universal egos; None where none was measured.
         best_ego: the universal ego that earns most beside Haland; None where none was measured.
         compared: which of the project's other methods `experiments.compare` measured.
         compared_seeds: how many egos of each kind it trained; None where it trained none.
@@ -94,6 +97,8 @@ class Overview:
     machine: str | None
     date: str | None
     shares: Mapping[str, Estimate]
+    steps: Mapping[str, tuple[int, float | None]]
+    gain: Gain | None
     best_ego: Standing | None
     compared: tuple[str, ...]
     compared_seeds: int | None
@@ -157,6 +162,12 @@ def overview(results: Mapping[str, Any]) -> Overview:
         machine=_machine(machine),
         date=machine.get("date"),
         shares=_shares(results),
+        steps={
+            one.method: (one.steps, one.budget)
+            for one in standings(results)
+            if one.steps is not None
+        },
+        gain=gain(results),
         best_ego=best_ego(results),
         compared=tuple(name for name in NAMES if name in compared),
         compared_seeds=next((one["seeds"] for one in compared.values() if "seeds" in one), None),

@@ -2,6 +2,7 @@
 
     python -m experiments.record runs/*-overnight-0     record these runs in docs/results
     python -m experiments.record                        make the pages anew, as after new remarks
+    python -m experiments.record runs/*-quick-0 --out docs/comparisons --readme None
 
 Each run goes to docs/results/<environment>/: results.json, report.md, the figures and one or two
 episodes. docs/results/README.md is made from all that is recorded there, and so is the table in
@@ -46,8 +47,9 @@ class Arguments:
     """Folders of finished runs, at most one for each environment."""
     out: Path = Path("docs/results")
     """Folder of the recorded results."""
-    readme: Path = Path("README.md")
-    """File whose table between the markers <!-- results --> and <!-- /results --> is written."""
+    readme: Path | None = Path("README.md")
+    """File whose table between the markers <!-- results --> and <!-- /results --> is written; None
+    for records that the README does not show."""
 
 
 @main_guard
@@ -62,13 +64,13 @@ def main() -> None:
         console.print("nothing has changed")
 
 
-def record(runs: Sequence[Path], out: Path, readme: Path) -> list[Path]:
+def record(runs: Sequence[Path], out: Path, readme: Path | None) -> list[Path]:
     """Records the runs and makes the pages; everything is checked before anything is written.
 
     Args:
         runs: folders of finished runs.
         out: folder of the recorded results.
-        readme: file with the two markers.
+        readme: file with the two markers, if any.
 
     Returns:
         The files that changed; empty if everything was up to date.
@@ -77,7 +79,8 @@ def record(runs: Sequence[Path], out: Path, readme: Path) -> list[Path]:
         UserError: a run is unfinished or too large, two are of one environment, nothing is
             recorded, or the README lacks its markers.
     """
-    _split_readme(readme)
+    if readme is not None:
+        _split_readme(readme)
     recorded: dict[str, dict[PurePosixPath, bytes]] = {}
     for path in runs:
         environment, files = recorded_files(path)
@@ -95,6 +98,8 @@ def record(runs: Sequence[Path], out: Path, readme: Path) -> list[Path]:
         overviews, remarks.read_text(encoding="utf-8") if remarks.is_file() else ""
     )
     changed += [out / "README.md"] if _write(out / "README.md", page.encode()) else []
+    if readme is None:
+        return changed
     before, after = _split_readme(readme)
     table = results_page.short_table(overviews, _relative(out, readme.parent))
     text = f"{before}{_MARKERS[0]}\n\n{table}\n\n{_MARKERS[1]}{after}"

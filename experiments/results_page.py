@@ -6,7 +6,7 @@ import envs
 from experiments.markdown import table
 from experiments.overview import Overview, number, percent
 from experiments.run_all import ALL, default_path
-from experiments.standing import Standing
+from experiments.standing import Standing, improvement_in_words
 from experiments.worth import steps_in_words
 
 AIM = 0.95
@@ -201,12 +201,34 @@ def beside_others(overviews: Sequence[Overview]) -> str:
     ]
     head = ("method", *(row.environment for row in found))
     said = [f"- **{row.environment}**: {_beside(row.best_ego)}" for row in found if row.best_ego]
-    return (
+    parts = (
         "## Beside other methods\n\nReturn / Oracle with held-out partners: interquartile mean "
-        "over styles and held-out seeds, with its stratified bootstrap interval (95%).\n\n"
-        + table(head, rows, "l" + "r" * len(found))
-        + "\n\n"
-        + "\n".join(said)
+        "over styles and held-out seeds, with its stratified bootstrap interval (95%).",
+        table(head, rows, "l" + "r" * len(found)),
+        "\n".join(said),
+        improvement_in_words(row.gain for row in found),
+        _budgets(found),
+    )
+    return "\n\n".join(filter(None, parts))
+
+
+def _budgets(found: Sequence[Overview]) -> str:
+    """What the egos of other methods took to learn; empty where none learnt in games."""
+    methods = list(dict.fromkeys(name for row in found for name in row.steps))
+    if not methods:
+        return ""
+
+    def shown(row: Overview, method: str) -> str:
+        steps, budget = row.steps.get(method, (None, None))
+        if steps is None:
+            return "–"
+        return steps_in_words(steps) + ("" if budget is None else f" ({budget:.0%})")
+
+    rows = [(method, *(shown(row, method) for row in found)) for method in methods]
+    return (
+        "Environment steps that one ego took to learn, and as a share of those of all best "
+        "responses together (their pairs and their refits):\n\n"
+        + table(("method", *(row.environment for row in found)), rows, "l" + "r" * len(found))
     )
 
 

@@ -46,6 +46,21 @@ def test_runs_with_different_numbers_of_seeds_are_joined():
     assert standing.estimates([one, other], "General Ego") is None
 
 
+def test_universal_egos_are_drawn_by_their_steps():
+    results = made_up_results()
+    assert not paper.FIGURES["universal_learning"].runs(results)
+    curves = {"General Ego": [[1.0, 3.0], [2.0, 6.0]], "Adaptive Ego": [[0.0, 1.0], [0.0, 1.0]]}
+    results["compared"] = {
+        "universal": {"curve_steps": [2e6, 4e6], "curve_returns": curves},
+        "no-vae": {"by_ego": {}},
+    }
+    assert paper.FIGURES["universal_learning"].runs(results)
+    general, adaptive = paper.universal_learning(results).axes[0].lines
+    assert general.get_label() == "General Ego"
+    np.testing.assert_allclose(general.get_xydata(), [[2.0, 1.5], [4.0, 4.5]])
+    assert general.get_marker() != adaptive.get_marker(), "to be told apart in grey"
+
+
 def test_figure_4_has_a_row_for_every_seed_of_the_adaptive_ego():
     results = made_up_results()
     played = np.arange(8 * 6, dtype=float).reshape(8, 6)  # seeds 0, 1, 2, 0, 1, 2
@@ -86,8 +101,19 @@ def test_the_improvement_by_hand():
         return {"styles": ["s"], "oracle": {"s": [10.0]}, "methods": methods}
 
     # Beside the best: 10 / 5 - 1 = 1 and 9 / 9 - 1 = 0; beside each: 1, 4, 0, 2.
-    found = standing.improvement([run(10.0, 5.0, 2.0), run(9.0, 9.0, 3.0), run(1.0)])
-    assert found == pytest.approx({"best": 0.5, "each": 1.75})
+    runs = [run(10.0, 5.0, 2.0), run(9.0, 9.0, 3.0), run(1.0)]
+    found = standing.improvement(map(standing.gain, runs))
+    assert found is not None
+    assert found.best == pytest.approx(0.5)
+    assert found.each == pytest.approx((1.75,))
+    said = standing.improvement_in_words(map(standing.gain, runs))
+    assert "+50.0% beside the best" in said
+    assert "+175.0% beside each" in said
+    # Beside an ego that loses there is no share: it is left out, and nothing is said of it alone.
+    losing = standing.gain(run(5.0, 4.0, -1.0))
+    assert losing is not None
+    np.testing.assert_allclose([losing.best, *losing.each], [0.25, 0.25, np.nan])
+    assert standing.improvement_in_words([standing.gain(run(5.0, -1.0)), None]) == ""
 
 
 def test_folders_that_are_no_runs_are_refused(capsys, monkeypatch, tmp_path):

@@ -256,6 +256,13 @@ def test_a_second_environment_joins_and_a_new_run_replaces_the_old(tmp_path, rea
     assert json.loads((out / KITCHEN / "results.json").read_text())["seed"] == 5
 
 
+def test_records_that_the_readme_does_not_show_leave_it_alone(tmp_path, readme):
+    out = tmp_path / "comparisons"
+    changed = record.record([finished(tmp_path / "run")], out, None)
+    assert out / "README.md" in changed
+    assert readme.read_text() == README
+
+
 def test_episodes_are_left_out_before_a_record_grows_too_large(tmp_path, monkeypatch):
     run = finished(tmp_path / "run")
     _, files = record.recorded_files(run)

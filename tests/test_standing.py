@@ -80,3 +80,6 @@ def test_report_and_page_name_the_best_universal_ego(tmp_path):
     assert "is ahead of the best universal ego, Universal ego with the style's label" in page
     assert "(10 M steps, 25% of those of all best responses)" in page
     assert np.isclose(row.shares[HEADLINE].value, 0.92, atol=0.03)
+    assert "| General Ego | 20 M (50%) |" in page
+    assert f"| {UNIVERSAL} | 10 M (25%) |" in page
+    assert "beside the best universal ego of each environment" in page

@@ -4,8 +4,8 @@
     python -m experiments.figures docs/results/*/*
 
 Each as PNG and PDF: Fig. 3 (all methods in all environments), 4 (Adaptive Egos by seed), 5 and 12
-(strips of games), 6a and 6b (sentences), 8 to 11 (events), Table 1. Those whose numbers are missing
-are named with the command that makes them.
+(strips of games), 6a and 6b (sentences), 8 to 11 (events), Table 1, and how universal egos learnt.
+Those whose numbers are missing are named with the command that makes them.
 """
 
 import dataclasses
@@ -20,11 +20,12 @@ from rich.table import Table
 
 from experiments.errors import UserError, main_guard
 from experiments.figures import paper
-from experiments.standing import improvement
+from experiments.standing import gain, improvement_in_words
 
 MISSING = {
     **dict.fromkeys(("figure_5", "figure_12"), "make the run again with this version"),
     "figure_4": "python -m experiments.compare RUN --methods universal",
+    "universal_learning": "python -m experiments.compare RUN --methods universal universal-mlp",
     "figure_6a": "python -m experiments.compare RUN --methods no-fine-tuning",
     "table_1": "python -m experiments.compare RUN --methods cgan-mlp cgan-unet no-translator "
     "no-vae",
@@ -62,12 +63,8 @@ def main() -> None:
         hint = f"[yellow]missing; first: {missing}[/]" if missing else "[yellow]missing[/]"
         table.add_row(name.replace("_", " "), paper.FIGURES[name].title, shown or hint)
     console.print(table)
-    more = improvement(runs)
-    if more["best"] == more["best"]:
-        console.print(
-            f"Haland earns {more['best']:+.1%} beside the best universal ego of each environment, "
-            f"{more['each']:+.1%} beside each of them, on average (the paper states +89.64%)."
-        )
+    if said := improvement_in_words(map(gain, runs)):
+        console.print(said)
 
 
 def read_runs(folders: tuple[Path, ...]) -> list[dict[str, Any]]:

@@ -21,7 +21,7 @@ from experiments.figures.style import (
     words,
 )
 from experiments.markdown import table
-from experiments.standing import ABLATIONS, ADAPTIVE, Results, compared, estimates
+from experiments.standing import ABLATIONS, ADAPTIVE, EGOS, Results, compared, estimates
 from experiments.summary import HEADLINE, ORACLE, mean, ratios, returns, shares, spread
 
 TRAINING = "Haland, training sentences"
@@ -159,6 +159,31 @@ def ablation_bars(results: Results) -> Figure:
     return grouped_bars(results, table_1_methods(results))
 
 
+def universal_learning(results: Results) -> Figure:
+    """Not in the paper: how the universal egos learnt, and whether they had learnt all they could.
+
+    Return of the training games, some of which start at a random moment, by environment steps of an
+    ego, a line a kind (mean over its seeds).
+    """
+    figure = new_figure(6.4, 3.6)
+    axes = figure.add_subplot()
+    for trained in results["compared"].values():
+        for name, curves in trained.get("curve_returns", {}).items():
+            number = EGOS.index(name) if name in EGOS else len(EGOS)
+            axes.plot(
+                np.asarray(trained["curve_steps"], float) / 1e6,
+                np.asarray(curves, float).mean(axis=0),
+                label=name, linewidth=1.2, markersize=4, markevery=4,
+                marker=_MARKERS[number % len(_MARKERS)],
+            )  # fmt: skip
+    axes.set_xlabel("environment steps of an ego (millions)")
+    axes.set_ylabel("return of training games")
+    axes.grid(axis="y", color="#dddddd", linewidth=0.6)
+    axes.set_xlim(left=0)
+    figure.legend(loc="outside right upper", frameon=False)
+    return figure
+
+
 def table_1_methods(results: Results) -> list[str]:
     """The columns of Table 1 that were measured."""
     return [
@@ -214,6 +239,11 @@ FIGURES = {
     ),
     "figure_8_to_11": Drawing(
         "frequencies of events by style", lambda run: "task_language" in run, task_language
+    ),
+    "universal_learning": Drawing(
+        "how universal egos learnt (not in the paper)",
+        lambda run: any("curve_returns" in one for one in run.get("compared", {}).values()),
+        universal_learning,
     ),
     "table_1": Drawing(
         "Haland without its parts",
