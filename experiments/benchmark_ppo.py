@@ -83,7 +83,7 @@ def measure_recurrent(
 
 
 def _measure(
-    train: Callable[[Any], tuple[Any, dict[str, jax.Array]]], state: Any, steps: int, repeats: int
+    train: Callable[[Any], tuple[Any, dict[str, Any]]], state: Any, steps: int, repeats: int
 ) -> dict[str, float]:
     """Speed of a chunk of `steps` steps that donates its state, and seconds to compile."""
     seconds = []
