@@ -31,6 +31,7 @@ from experiments import devices
 from experiments.compared import NAMES, STAGE, refuse_taken_names, with_compared
 from experiments.errors import UserError, as_user_error, choose, main_guard
 from experiments.progress import RunProgress
+from experiments.restore import RESTORED
 from experiments.run_folder import RunFolder
 from experiments.summary import ORACLE, return_digits, summarise
 
@@ -91,16 +92,17 @@ def measure(
 
     Raises:
         UserError: there is no finished run at `path`, another process writes it, a method was
-            measured with other steps or seeds already, or `added` defines no methods.
+            measured with other steps or seeds already, `added` defines no methods, or an ablation
+            is asked of a run that came from a record.
     """
     from experiments import report
     from experiments.finished_run import open_run
     from experiments.judge import Judge
-    from experiments.methods import METHODS, Given
-    from experiments.stages import Run
+    from experiments.methods import ABLATIONS, METHODS, Given
+    from experiments.stages import STAGE_NAMES, Run
 
     RunFolder.read(path, ("report",))
-    config = open_run(path).config
+    config = open_run(path, RESTORED).config
     chosen = {name: METHODS[name] for name in names} | (read_methods(added) if added else {})
     stages = {name: f"{STAGE}{name}" for name in chosen}
     with (
@@ -116,7 +118,13 @@ def measure(
         }
         # All that can be wrong with what was asked for is said before anything is trained.
         updates: dict[str, int | None] = {}
+        unmade = [stage for stage in STAGE_NAMES if not folder.stage_done(stage)]
         for name, method in chosen.items():
+            if name in ABLATIONS and unmade and not folder.stage_done(stages[name]):
+                raise UserError(
+                    f"'{name}' is Haland without a part, and the run in {path} has no Haland (its "
+                    f"stage '{unmade[0]}' is not done); make one with python -m experiments.run"
+                )
             if folder.stage_done(stages[name]):
                 _expect_same(name, stages[name], folder.stage_metrics(stages[name]), budgets[name])
             with as_user_error():

@@ -10,22 +10,27 @@ from experiments.stages import STAGE_NAMES, Run
 from haland_jax.configuration import filled
 
 
-def open_run(path: Path) -> Run:
+def open_run(path: Path, stages: tuple[str, ...] = STAGE_NAMES) -> Run:
     """Opens a run whose policy-making stages are all finished.
 
     Args:
         path: the run folder.
+        stages: those that are needed; all by default.
 
     Raises:
         UserError: there is no finished run, or it was made by another version's preset.
     """
-    folder = RunFolder.read(path, STAGE_NAMES)
+    folder = RunFolder.read(path, stages)
     with as_user_error():
-        return Run(_configuration(path, folder.configuration), folder)
+        return Run(configuration_from(path, folder.configuration), folder)
 
 
-def _configuration(path: Path, stored: dict[str, Any]) -> RunConfig:
-    """The run's configuration as dataclasses, from its config.json."""
+def configuration_from(path: Path, stored: dict[str, Any]) -> RunConfig:
+    """The run's configuration as dataclasses, from its config.json.
+
+    Raises:
+        UserError: it was made by another version's preset.
+    """
     template = PRESETS.get(stored.get("preset", ""))
     if template is None:
         raise UserError(

@@ -2,7 +2,7 @@
 
     python -m experiments.record runs/*-overnight-0     record these runs in docs/results
     python -m experiments.record                        make the pages anew, as after new remarks
-    python -m experiments.record runs/*-quick-0 --out docs/comparisons --readme None
+    python -m experiments.record runs/*-quick-0 --out docs/comparisons --readme None --players
 
 Each run goes to docs/results/<environment>/: results.json, report.md, the figures and one or two
 episodes. docs/results/README.md is made from all that is recorded there, and so is the table in
@@ -50,13 +50,16 @@ class Arguments:
     readme: Path | None = Path("README.md")
     """File whose table between the markers <!-- results --> and <!-- /results --> is written; None
     for records that the README does not show."""
+    players: bool = False
+    """Record the players too, so that others can compare methods with the very same partners
+    (python -m experiments.restore)."""
 
 
 @main_guard
 def main() -> None:
     """The command."""
     arguments = tyro.cli(Arguments, prog="python -m experiments.record")
-    changed = record(arguments.runs, arguments.out, arguments.readme)
+    changed = record(arguments.runs, arguments.out, arguments.readme, arguments.players)
     console = Console(highlight=False)
     for path in changed:
         console.print(f"written: {path}", soft_wrap=True)
@@ -64,13 +67,16 @@ def main() -> None:
         console.print("nothing has changed")
 
 
-def record(runs: Sequence[Path], out: Path, readme: Path | None) -> list[Path]:
+def record(
+    runs: Sequence[Path], out: Path, readme: Path | None, players: bool = False
+) -> list[Path]:
     """Records the runs and makes the pages; everything is checked before anything is written.
 
     Args:
         runs: folders of finished runs.
         out: folder of the recorded results.
         readme: file with the two markers, if any.
+        players: whether to record the players too.
 
     Returns:
         The files that changed; empty if everything was up to date.
@@ -83,7 +89,7 @@ def record(runs: Sequence[Path], out: Path, readme: Path | None) -> list[Path]:
         _split_readme(readme)
     recorded: dict[str, dict[PurePosixPath, bytes]] = {}
     for path in runs:
-        environment, files = recorded_files(path)
+        environment, files = recorded_files(path, players)
         if environment in recorded:
             raise UserError(f"{path} is a second run of {environment}; record one of each")
         recorded[environment] = files
@@ -106,8 +112,12 @@ def record(runs: Sequence[Path], out: Path, readme: Path | None) -> list[Path]:
     return [*changed, readme] if _write(readme, text.encode()) else changed
 
 
-def recorded_files(path: Path) -> tuple[str, dict[PurePosixPath, bytes]]:
+def recorded_files(path: Path, players: bool = False) -> tuple[str, dict[PurePosixPath, bytes]]:
     """What is kept of a run: its environment, and the content of each file.
+
+    Args:
+        path: folder of a finished run.
+        players: whether its players are kept too.
 
     Raises:
         UserError: the run is unfinished, or its figures alone are larger than the limit.
@@ -125,6 +135,11 @@ def recorded_files(path: Path) -> tuple[str, dict[PurePosixPath, bytes]]:
             for file in sorted((path / "figures").glob("*.png"))
         },
     }
+    if players:
+        from experiments import players as of_run
+        from experiments.finished_run import open_run
+
+        files[PurePosixPath(of_run.FILE)] = of_run.packed(open_run(path))
     text = report.read_text(encoding="utf-8")
     used = _size(files) + len(text.encode())
     if used > LIMIT_BYTES:

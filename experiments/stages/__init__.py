@@ -4,6 +4,7 @@ A stage is a function of a `Run` and its progress; it saves its result as a chec
 the matching `load_…` restores, and returns metrics.
 """
 
+from experiments.stages.best_responses import Archive as Archive
 from experiments.stages.best_responses import load_archive as load_archive
 from experiments.stages.best_responses import load_task_language as load_task_language
 from experiments.stages.best_responses import make_best_responses, make_task_language
@@ -18,6 +19,7 @@ from experiments.stages.model import load_vae as load_vae
 from experiments.stages.model import prepare_instructions as prepare_instructions
 from experiments.stages.population import load_population as load_population
 from experiments.stages.population import make_partners
+from experiments.stages.population import population_shapes as population_shapes
 from experiments.stages.universal import load_universal as load_universal
 from experiments.stages.universal import load_universal_in as load_universal_in
 from experiments.stages.universal import train_universal

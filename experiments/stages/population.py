@@ -50,8 +50,8 @@ def make_partners(run: Run, task: StageProgress) -> dict[str, Any]:
     }
 
 
-def load_population(run: Run) -> Population:
-    """The partners that `make_partners` kept."""
+def population_shapes(run: Run) -> Population:
+    """What `make_partners` keeps, as `jax.ShapeDtypeStruct`s."""
     config, env = run.config.partners, run.env
     start = partial(partners.init_pairs, env, config.joint, config.num_seeds)
     shapes = jax.eval_shape(start, jax.random.key(0))
@@ -67,7 +67,7 @@ def load_population(run: Run) -> Population:
         )
 
     shape: Any = jax.ShapeDtypeStruct
-    like = Population(
+    return Population(
         partners=by_style(shapes.partner.actor),
         egos=by_style(jax.eval_shape(Player.of, shapes.ego)),
         joint_returns=shape((styles, config.num_seeds), jnp.float32),
@@ -75,7 +75,11 @@ def load_population(run: Run) -> Population:
         held_out_index=shape((styles, config.held_out_seeds), jnp.int32),
         known_index=shape((styles, config.known_seeds), jnp.int32),
     )
-    return checkpoint.restore(run.path("partners", "population"), like)
+
+
+def load_population(run: Run) -> Population:
+    """The partners that `make_partners` kept."""
+    return checkpoint.restore(run.path("partners", "population"), population_shapes(run))
 
 
 def mean_returns(
