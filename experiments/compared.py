@@ -13,6 +13,8 @@ NAMES = (
 """The methods that come with the project."""
 COMPARED = "compared"
 """Where results.json says what the methods were trained with."""
+PLAYERS = "players.safetensors"
+"""The file of a record that has the players."""
 STAGE = "method_"
 """What the folders of methods begin with."""
 

@@ -1,7 +1,7 @@
 """What one run found in one row, so that environments can stand side by side."""
 
 import dataclasses
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from typing import Any
 
 import numpy as np
@@ -66,8 +66,8 @@ class Overview:
             share of the steps of all best responses together, where that is known.
         gain: how much more Haland earns than universal egos; None where none was measured.
         best_ego: the universal ego that earns most beside Haland; None where none was measured.
-        compared: which of the project's other methods `experiments.compare` measured.
-        compared_seeds: how many egos of each kind it trained; None where it trained none.
+        compared: which of the project's other methods `experiments.compare` measured, by the
+            options of the command.
     """
 
     environment: str
@@ -100,8 +100,7 @@ class Overview:
     steps: Mapping[str, tuple[int, float | None]]
     gain: Gain | None
     best_ego: Standing | None
-    compared: tuple[str, ...]
-    compared_seeds: int | None
+    compared: Mapping[str, Sequence[str]]
 
     def amount(self, value: float | None) -> str:
         """A return of this environment for a reader; a dash for what was not measured."""
@@ -131,7 +130,6 @@ def overview(results: Mapping[str, Any]) -> Overview:
     machine = results.get("machine", {})
     rows = {row.method: row for row in summarise(results)}
     times, gates = results.get("times"), results.get("gates", {})
-    compared = results.get(COMPARED, {})
     return Overview(
         environment=results["environment"],
         preset=results["preset"],
@@ -169,8 +167,7 @@ def overview(results: Mapping[str, Any]) -> Overview:
         },
         gain=gain(results),
         best_ego=best_ego(results),
-        compared=tuple(name for name in NAMES if name in compared),
-        compared_seeds=next((one["seeds"] for one in compared.values() if "seeds" in one), None),
+        compared=_compared(results),
     )
 
 
@@ -188,6 +185,22 @@ def _shares(results: Mapping[str, Any]) -> dict[str, Estimate]:
     found = standings(results)
     haland = {HEADLINE: found[0].haland} if found else {}
     return haland | {one.method: one.share for one in found}
+
+
+def _compared(results: Mapping[str, Any]) -> dict[str, list[str]]:
+    """Methods by what the command was asked for; those that any command makes join the first."""
+    budget = results.get("universal", {}).get("best_response_steps")
+    groups: dict[str, list[str]] = {}
+    for name, found in results.get(COMPARED, {}).items():
+        options = f" --seeds {found['seeds']}" if "seeds" in found else ""
+        if found.get("asked_steps", budget) != budget:
+            options += f" --steps {found['asked_steps']}"
+        if name in NAMES:
+            groups.setdefault(options, []).append(name)
+    anyhow = groups.pop("", [])
+    if anyhow:
+        groups.setdefault(next(iter(groups), ""), []).extend(anyhow)
+    return {options: sorted(names, key=NAMES.index) for options, names in groups.items()}
 
 
 def _share(results: Mapping[str, Any], method: str) -> float | None:

@@ -31,7 +31,6 @@ from experiments.stages import (
 from haland_jax import checkpoint
 from haland_jax.partners import Population
 
-FILE = "players.safetensors"
 _FORMAT = "1"
 _INDICES = ("train_index", "held_out_index", "known_index")
 

@@ -6,8 +6,9 @@
 
 Each run goes to docs/results/<environment>/: results.json, report.md, the figures and one or two
 episodes. docs/results/README.md is made from all that is recorded there, and so is the table in
-the README between its two markers. Remarks by hand go to docs/results/remarks.md, which is
-included; everything else in that folder is written by this command.
+the README between its two markers. Where other methods were compared, the paper's figures that show
+them are drawn too, from all that is recorded. Remarks by hand go to docs/results/remarks.md, which
+is included; everything else in that folder is written by this command.
 """
 
 import dataclasses
@@ -15,6 +16,7 @@ import io
 import json
 import os
 import re
+import tempfile
 from collections.abc import Mapping, Sequence
 from pathlib import Path, PurePosixPath
 from typing import Any
@@ -24,12 +26,16 @@ from PIL import Image
 from rich.console import Console
 
 from experiments import results_page
+from experiments.compared import COMPARED, PLAYERS
 from experiments.errors import UserError, main_guard
 from experiments.overview import Overview, overview
 from experiments.run_folder import RunFolder
 
+OUT = Path("docs/results")
 LIMIT_BYTES = 4_000_000
 EPISODES = 2
+COMPARING = ("figure_3", "figure_4", "figure_6a", "universal_learning", "table_1")
+"""The paper's figures that show other methods."""
 _COLOURS = 128
 _MARKERS = ("<!-- results -->", "<!-- /results -->")
 _LINK = re.compile(r"\]\(([^)#:]+)\)")
@@ -45,7 +51,7 @@ class Arguments:
 
     runs: tyro.conf.Positional[tuple[Path, ...]] = ()
     """Folders of finished runs, at most one for each environment."""
-    out: Path = Path("docs/results")
+    out: Path = OUT
     """Folder of the recorded results."""
     readme: Path | None = Path("README.md")
     """File whose table between the markers <!-- results --> and <!-- /results --> is written; None
@@ -99,11 +105,16 @@ def record(
         changed += [f for f in _stale_pictures(folder, files) if _remove(f)]
         changed += [folder / name for name, data in files.items() if _write(folder / name, data)]
     overviews = read_overviews(out)
+    drawn = drawn_comparisons(out)
     remarks = out / "remarks.md"
     page = results_page.page(
-        overviews, remarks.read_text(encoding="utf-8") if remarks.is_file() else ""
+        overviews,
+        remarks.read_text(encoding="utf-8") if remarks.is_file() else "",
+        next((_relative(file, out) for file in drawn if file.stem == "figure_3"), ""),
+        _options(out, readme),
     )
     changed += [out / "README.md"] if _write(out / "README.md", page.encode()) else []
+    changed += [file for file, data in drawn.items() if _write(file, data)]
     if readme is None:
         return changed
     before, after = _split_readme(readme)
@@ -136,10 +147,10 @@ def recorded_files(path: Path, players: bool = False) -> tuple[str, dict[PurePos
         },
     }
     if players:
-        from experiments import players as of_run
         from experiments.finished_run import open_run
+        from experiments.players import packed
 
-        files[PurePosixPath(of_run.FILE)] = of_run.packed(open_run(path))
+        files[PurePosixPath(PLAYERS)] = packed(open_run(path))
     text = report.read_text(encoding="utf-8")
     used = _size(files) + len(text.encode())
     if used > LIMIT_BYTES:
@@ -185,6 +196,30 @@ def read_overviews(out: Path) -> list[Overview]:
     if not files:
         raise UserError(f"nothing is recorded in {out}; name the folders of finished runs")
     return [overview(json.loads(file.read_text(encoding="utf-8"))) for file in files]
+
+
+def _options(out: Path, readme: Path | None) -> str:
+    """What a command has to say that records what is recorded here."""
+    said = "" if out == OUT else f" --out {out.as_posix()}"
+    said += " --readme None" if readme is None else ""
+    return said + (" --players" if any(out.rglob(PLAYERS)) else "")
+
+
+def drawn_comparisons(out: Path) -> dict[Path, bytes]:
+    """The paper's figures that compare methods, by their places; none where none were compared."""
+    from experiments.figures import paper
+    from experiments.figures.reading import read_runs
+
+    folders = [file.parent for file in sorted(out.rglob("results.json"))]
+    runs = [run for run in read_runs(folders) if COMPARED in run]
+    if not runs:
+        return {}
+    with tempfile.TemporaryDirectory() as temporary:
+        paper.draw_paper(runs, Path(temporary), COMPARING)
+        return {
+            out / "figures" / file.name: _with_fewer_colours(file)
+            for file in sorted(Path(temporary).glob("*.png"))
+        }
 
 
 def _with_fewer_colours(file: Path) -> bytes:

@@ -18,7 +18,7 @@ import tyro
 from rich.console import Console
 
 from experiments import devices
-from experiments.compared import COMPARED, STAGE
+from experiments.compared import COMPARED, PLAYERS, STAGE
 from experiments.errors import UserError, as_user_error, main_guard
 from experiments.run_all import default_path
 from experiments.run_folder import RunFolder
@@ -65,7 +65,7 @@ def restore(record: Path, out: Path | None = None) -> Path:
     from experiments.finished_run import configuration_from
     from experiments.stages import Run
 
-    arrays, texts = players.read(record / players.FILE)
+    arrays, texts = players.read(record / PLAYERS)
     file = record / "results.json"
     if not file.is_file():
         raise UserError(f"{file} is missing; name a record made by python -m experiments.record")

@@ -116,18 +116,21 @@ _HOW: tuple[_Column, ...] = (
 )
 
 
-def page(overviews: Sequence[Overview], remarks: str) -> str:
+def page(overviews: Sequence[Overview], remarks: str, picture: str = "", options: str = "") -> str:
     """The page of all recorded results.
 
     Args:
         overviews: a row for each recorded environment, in order.
         remarks: Markdown by hand, included as it is; empty for none.
+        picture: link to a figure of all methods; empty for none.
+        options: of the command that records these results.
     """
     sections = [
         "<!-- Made by python -m experiments.record; remarks by hand belong in remarks.md. -->",
         f"# Results\n\n{_verdict(overviews)}",
         _table(overviews, _MEASURED),
         _meanings(_MEASURED),
+        beside_others(overviews, picture),
         "## What knowing the style is worth\n\nReturns per episode with held-out partners, mean "
         "over styles.\n\n" + _table(overviews, _WORTH),
         _meanings(_WORTH[1:]),
@@ -136,10 +139,9 @@ def page(overviews: Sequence[Overview], remarks: str) -> str:
         "partner's style. Where the *universal ego* comes near *own style*, it can see the style "
         "for itself, and a sentence has little to add; where being *told* helps it, it cannot.",
         _sights(overviews),
-        beside_others(overviews),
         "## How it was measured\n\n" + _table(overviews, _HOW),
         "To make the same runs, and this page from them:\n\n```bash\n"
-        + "\n".join(_commands(overviews))
+        + "\n".join(_commands(overviews, options))
         + "\n```",
     ]
     if remarks.strip():
@@ -189,7 +191,7 @@ def _sights(overviews: Sequence[Overview]) -> str:
     )
 
 
-def beside_others(overviews: Sequence[Overview]) -> str:
+def beside_others(overviews: Sequence[Overview], picture: str) -> str:
     """Haland and all other methods by environment; empty where nothing was compared."""
     found = [row for row in overviews if row.shares]
     if not found:
@@ -204,6 +206,7 @@ def beside_others(overviews: Sequence[Overview]) -> str:
     parts = (
         "## Beside other methods\n\nReturn / Oracle with held-out partners: interquartile mean "
         "over styles and held-out seeds, with its stratified bootstrap interval (95%).",
+        f"![return / Oracle of all methods]({picture})" if picture else "",
         table(head, rows, "l" + "r" * len(found)),
         "\n".join(said),
         improvement_in_words(row.gain for row in found),
@@ -279,7 +282,7 @@ def _success(shares: tuple[float, float] | None) -> str:
     return "–" if shares is None else f"{shares[1]:.2f} ({shares[0]:.2f})"
 
 
-def _commands(overviews: Sequence[Overview]) -> list[str]:
+def _commands(overviews: Sequence[Overview], options: str) -> list[str]:
     """The commands that make the runs, compare other methods in them, and record them."""
     made, recorded = [], []
     for preset, seed in dict.fromkeys((row.preset, row.seed) for row in overviews):
@@ -288,15 +291,16 @@ def _commands(overviews: Sequence[Overview]) -> list[str]:
         with_seed = f" --seed {seed}" if seed else ""
         made.append(f"uv run python -m experiments.run --env {asked} --preset {preset}{with_seed}")
         recorded.append(f"runs/*-{preset}-{seed}")
-    compared = [_comparison(row) for row in overviews if row.compared]
-    return [*made, *compared, f"uv run python -m experiments.record {' '.join(recorded)}"]
+    compared = [command for row in overviews for command in _comparisons(row)]
+    record = f"uv run python -m experiments.record {' '.join(recorded)}{options}"
+    return [*made, *compared, record]
 
 
-def _comparison(row: Overview) -> str:
-    """The command that measured other methods in a run."""
+def _comparisons(row: Overview) -> list[str]:
+    """The commands that measured other methods in a run."""
     run = default_path(row.environment, row.preset, row.seed)
-    seeds = "" if row.compared_seeds is None else f" --seeds {row.compared_seeds}"
-    return (
-        f"uv run python -m experiments.compare {run.as_posix()}{seeds} "
-        f"--methods {' '.join(row.compared)}"
-    )
+    return [
+        f"uv run python -m experiments.compare {run.as_posix()}{options} "
+        f"--methods {' '.join(names)}"
+        for options, names in row.compared.items()
+    ]

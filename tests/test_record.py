@@ -171,6 +171,27 @@ def test_the_page_has_the_commands_that_compared_other_methods():
     assert page.count("experiments.compare") == 1
 
 
+def test_what_was_asked_for_stands_in_the_commands():
+    """Methods are grouped by their options; 40 steps are those of all best responses."""
+    universal = {"steps": 10, "best_response_steps": 40}
+    budget = {"by_ego": {}, "seeds": 1}
+    compared = {
+        "universal": {**budget, "asked_steps": 10},
+        "universal-mlp": {**budget, "asked_steps": 40},
+        "fcp": {**budget, "asked_steps": 40},
+        "cgan-mlp": {"by_ego": {}},
+    }
+    results = small_results(compared=compared, universal=universal)
+    page = results_page.page([overview(results)], "", options=" --players")
+    run = f"runs/{KITCHEN.replace('/', '-')}-overnight-0"
+    for said in (
+        "--seeds 1 --steps 10 --methods universal cgan-mlp",
+        "--seeds 1 --methods universal-mlp fcp",
+    ):
+        assert f"uv run python -m experiments.compare {run} {said}\n" in page
+    assert "experiments.record runs/*-overnight-0 --players\n" in page
+
+
 def picture(path: Path, size: tuple[int, int] = (60, 40)) -> None:
     path.parent.mkdir(parents=True, exist_ok=True)
     noise = np.random.default_rng(0).integers(0, 256, (size[1], size[0], 3), np.uint8)
@@ -261,6 +282,17 @@ def test_records_that_the_readme_does_not_show_leave_it_alone(tmp_path, readme):
     changed = record.record([finished(tmp_path / "run")], out, None)
     assert out / "README.md" in changed
     assert readme.read_text() == README
+    assert f"--out {out.as_posix()} --readme None\n" in (out / "README.md").read_text()
+
+
+def test_where_methods_were_compared_they_are_drawn(tmp_path):
+    compared = {"mine": {"by_ego": {"My method": [[1.0]] * 8}}}
+    results = made_up_results(others=("My method",))
+    run = finished(tmp_path / "run", compared=compared, methods=results["methods"])
+    out = tmp_path / "comparisons"
+    assert out / "figures" / "figure_3.png" in record.record([run], out, None)
+    assert "(figures/figure_3.png)" in (out / "README.md").read_text()
+    assert record.record([], out, None) == []
 
 
 def test_episodes_are_left_out_before_a_record_grows_too_large(tmp_path, monkeypatch):

@@ -9,7 +9,8 @@ import numpy as np
 import pytest
 from refused_command import refused
 
-from experiments import compare, players, record, restore
+from experiments import compare, record, restore
+from experiments.compared import PLAYERS
 from experiments.errors import UserError
 from experiments.finished_run import open_run
 from experiments.restore import RESTORED
@@ -27,7 +28,7 @@ def recorded(smoke_run, tmp_path_factory):
     run = Path(shutil.copytree(smoke_run, folder / "run"))
     compare.measure(run, (), added=EXAMPLE)
     record.record([run], folder / "out", None, players=True)
-    (found,) = (folder / "out").rglob(players.FILE)
+    (found,) = (folder / "out").rglob(PLAYERS)
     return run, found.parent
 
 
@@ -95,7 +96,7 @@ def test_what_a_record_does_not_hold_is_refused(capsys, monkeypatch, recorded, r
     line = refused(capsys, monkeypatch, restore, tmp_path)
     assert "players.safetensors is missing; name a record that has players" in line
     damaged = Path(shutil.copytree(recorded[1], tmp_path / "damaged"))
-    (damaged / players.FILE).write_bytes(b"nothing")
+    (damaged / PLAYERS).write_bytes(b"nothing")
     line = refused(capsys, monkeypatch, restore, damaged, "--out", tmp_path / "run")
     assert "is damaged" in line
     assert not (tmp_path / "run").exists()

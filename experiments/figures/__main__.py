@@ -9,10 +9,9 @@ Those whose numbers are missing are named with the command that makes them.
 """
 
 import dataclasses
-import json
 import time
 from pathlib import Path
-from typing import Annotated, Any
+from typing import Annotated
 
 import tyro
 from rich.console import Console
@@ -20,6 +19,7 @@ from rich.table import Table
 
 from experiments.errors import UserError, main_guard
 from experiments.figures import paper
+from experiments.figures.reading import read_runs
 from experiments.standing import gain, improvement_in_words
 
 MISSING = {
@@ -65,32 +65,6 @@ def main() -> None:
     console.print(table)
     if said := improvement_in_words(map(gain, runs)):
         console.print(said)
-
-
-def read_runs(folders: tuple[Path, ...]) -> list[dict[str, Any]]:
-    """The results of runs, in the order of their environments' names.
-
-    Raises:
-        UserError: a folder has no results.json, it is damaged, or two are of one environment.
-    """
-    found: dict[str, dict[str, Any]] = {}
-    for folder in folders:
-        file = folder / "results.json"
-        try:
-            results = json.loads(file.read_text(encoding="utf-8"))
-        except OSError as error:
-            raise UserError(
-                f"{file} cannot be read ({error.strerror}); name folders of runs"
-            ) from None
-        except ValueError as error:
-            raise UserError(f"{file} is damaged ({error}); make the run again") from None
-        if "environment" not in results or "methods" not in results:
-            raise UserError(f"{file} holds no results of a run; name folders of runs")
-        name = results["environment"]
-        if name in found:
-            raise UserError(f"{folder} is another run of {name}; name one of each environment")
-        found[name] = results
-    return [found[name] for name in sorted(found)]
 
 
 if __name__ == "__main__":

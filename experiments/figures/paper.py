@@ -1,6 +1,6 @@
 """The paper's figures and Table 1 from the results of several runs."""
 
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Collection, Sequence
 from pathlib import Path
 from typing import NamedTuple
 
@@ -253,19 +253,23 @@ FIGURES = {
 }
 
 
-def draw_paper(runs: Sequence[Results], folder: Path) -> dict[str, list[Path]]:
+def draw_paper(
+    runs: Sequence[Results], folder: Path, names: Collection[str] = FIGURES
+) -> dict[str, list[Path]]:
     """Draws all figures whose numbers are there.
 
     Args:
         runs: contents of results.json, one an environment.
         folder: where the files go; made if it is missing.
+        names: which figures; all by default.
 
     Returns:
         By figure, its files; a figure that no run has the numbers for has none.
     """
     folder.mkdir(parents=True, exist_ok=True)
     drawn: dict[str, list[Path]] = {}
-    for name, drawing in FIGURES.items():
+    for name in names:
+        drawing = FIGURES[name]
         having = [run for run in runs if drawing.runs(run)]
         drawn[name] = []
         with matplotlib.rc_context(STYLE):
@@ -274,7 +278,7 @@ def draw_paper(runs: Sequence[Results], folder: Path) -> dict[str, list[Path]]:
             for run in [] if drawing.together else having:
                 drawn[name].append(save(drawing.draw(run), folder, f"{name}_{_short(run)}"))
     for run in runs:
-        if FIGURES["table_1"].runs(run):
+        if "table_1" in names and FIGURES["table_1"].runs(run):
             file = folder / f"table_1_{_short(run)}.md"
             file.write_text(f"{table_1(run)}\n", encoding="utf-8")
             drawn["table_1"].append(file)
