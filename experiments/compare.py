@@ -28,10 +28,9 @@ from rich.console import Console
 from rich.table import Table
 
 from experiments import devices
-from experiments.compared import NAMES, STAGE, refuse_taken_names, with_compared
+from experiments.compared import NAMES, PLAYER_STAGES, STAGE, refuse_taken_names, with_compared
 from experiments.errors import UserError, as_user_error, choose, main_guard
 from experiments.progress import RunProgress
-from experiments.restore import RESTORED
 from experiments.run_folder import RunFolder
 from experiments.summary import ORACLE, return_digits, summarise
 
@@ -102,7 +101,7 @@ def measure(
     from experiments.stages import STAGE_NAMES, Run
 
     RunFolder.read(path, ("report",))
-    config = open_run(path, RESTORED).config
+    config = open_run(path, PLAYER_STAGES).config
     chosen = {name: METHODS[name] for name in names} | (read_methods(added) if added else {})
     stages = {name: f"{STAGE}{name}" for name in chosen}
     with (
@@ -118,13 +117,9 @@ def measure(
         }
         # All that can be wrong with what was asked for is said before anything is trained.
         updates: dict[str, int | None] = {}
-        unmade = [stage for stage in STAGE_NAMES if not folder.stage_done(stage)]
         for name, method in chosen.items():
-            if name in ABLATIONS and unmade and not folder.stage_done(stages[name]):
-                raise UserError(
-                    f"'{name}' is Haland without a part, and the run in {path} has no Haland (its "
-                    f"stage '{unmade[0]}' is not done); make one with python -m experiments.run"
-                )
+            if name in ABLATIONS and not folder.stage_done(stages[name]):
+                folder.expect_stages(STAGE_NAMES)
             if folder.stage_done(stages[name]):
                 _expect_same(name, stages[name], folder.stage_metrics(stages[name]), budgets[name])
             with as_user_error():

@@ -15,6 +15,8 @@ COMPARED = "compared"
 """Where results.json says what the methods were trained with."""
 PLAYERS = "players.safetensors"
 """The file of a record that has the players."""
+PLAYER_STAGES = ("partners", "best_responses", "task_language")
+"""The stages of a run that its players stand for."""
 STAGE = "method_"
 """What the folders of methods begin with."""
 

@@ -32,6 +32,8 @@ def run_pipeline(config: RunConfig, path: Path) -> dict[str, Any]:
     with RunFolder.write(path, config) as folder, RunProgress(names, folder) as progress:
         run = Run(config, folder)
         totals = _totals(config)
+        if folder.recorded_in is not None:
+            folder.expect_stages(STAGES)
         for name, stage in STAGES.items():
             if folder.stage_done(name):
                 progress.skip(name)

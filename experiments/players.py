@@ -19,6 +19,7 @@ import safetensors.numpy
 from flax import traverse_util
 from safetensors import SafetensorError, safe_open
 
+from experiments.configs import RunConfig
 from experiments.errors import UserError
 from experiments.stages import (
     Archive,
@@ -32,6 +33,7 @@ from haland_jax import checkpoint
 from haland_jax.partners import Population
 
 _FORMAT = "1"
+_POLICIES = ("partners", "egos", "oracles")
 _INDICES = ("train_index", "held_out_index", "known_index")
 
 
@@ -52,7 +54,7 @@ def packed(run: Run) -> bytes:
     # Policies that took up a normalisation have weights of several magnitudes.
     exact = run.config.partners.joint.normalise
     flat = {
-        name: _stored(np.asarray(leaf), exact)
+        name: _stored(name, np.asarray(leaf), exact)
         for name, leaf in traverse_util.flatten_dict(arrays, sep="/").items()
     }
     about = {
@@ -64,9 +66,11 @@ def packed(run: Run) -> bytes:
     return safetensors.numpy.save(flat, about)
 
 
-def _stored(array: np.ndarray, exact: bool) -> np.ndarray:
-    large = array.dtype == np.float32 and array.ndim > 2
-    return array.astype(np.float16) if large and not exact else array
+def _stored(name: str, array: np.ndarray, exact: bool) -> np.ndarray:
+    if exact or name.split("/")[0] not in _POLICIES:
+        return array
+    half = array.astype(np.float16)
+    return half if np.isfinite(half).all() else array
 
 
 def read(file: Path) -> tuple[dict[str, Any], Mapping[str, Any]]:
@@ -94,6 +98,24 @@ def read(file: Path) -> tuple[dict[str, Any], Mapping[str, Any]]:
         for name, leaf in flat.items()
     }
     return traverse_util.unflatten_dict(wide, sep="/"), texts
+
+
+def expect_same_run(
+    record: Path, arrays: Mapping[str, Any], config: RunConfig, results: Mapping[str, Any]
+) -> None:
+    """Checks that a record's players are those that its results are of.
+
+    Raises:
+        UserError: they are another run's.
+    """
+    there = results["environment"], results["preset"], results["seed"]
+    same = there == (config.environment, config.preset, config.seed)
+    joint = list(results["partners"]["joint_returns"].values())
+    if not same or not np.allclose(joint, arrays["returns"]["joint"], rtol=1e-5):
+        raise UserError(
+            f"{record} has the players of another run than its results are of; record the run "
+            "again, with --players"
+        )
 
 
 def unpack_into(run: Run, arrays: Mapping[str, Any], texts: Mapping[str, Any]) -> None:

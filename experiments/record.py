@@ -4,11 +4,12 @@
     python -m experiments.record                        make the pages anew, as after new remarks
     python -m experiments.record runs/*-quick-0 --out docs/comparisons --readme None --players
 
-Each run goes to docs/results/<environment>/: results.json, report.md, the figures and one or two
-episodes. docs/results/README.md is made from all that is recorded there, and so is the table in
-the README between its two markers. Where other methods were compared, the paper's figures that show
-them are drawn too, from all that is recorded. Remarks by hand go to docs/results/remarks.md, which
-is included; everything else in that folder is written by this command.
+Each run goes to docs/results/<environment>/: results.json, report.md, the figures, one or two
+episodes and, if asked for, the players. docs/results/README.md is made from all that is recorded
+there, and so is the table in the README between its two markers. Where other methods were compared,
+the paper's figures that show them are drawn too, from all that is recorded. Remarks by hand go to
+docs/results/remarks.md, which is included; everything else in that folder is written by this
+command.
 """
 
 import dataclasses
@@ -26,7 +27,7 @@ from PIL import Image
 from rich.console import Console
 
 from experiments import results_page
-from experiments.compared import COMPARED, PLAYERS
+from experiments.compared import COMPARED, PLAYER_STAGES, PLAYERS
 from experiments.errors import UserError, main_guard
 from experiments.overview import Overview, overview
 from experiments.run_folder import RunFolder
@@ -76,7 +77,7 @@ def main() -> None:
 def record(
     runs: Sequence[Path], out: Path, readme: Path | None, players: bool = False
 ) -> list[Path]:
-    """Records the runs and makes the pages; everything is checked before anything is written.
+    """Records the runs and makes the pages; the runs are checked before anything is written.
 
     Args:
         runs: folders of finished runs.
@@ -102,7 +103,7 @@ def record(
     changed = []
     for environment, files in recorded.items():
         folder = out / environment
-        changed += [f for f in _stale_pictures(folder, files) if _remove(f)]
+        changed += [f for f in _stale_files(folder, files) if _remove(f)]
         changed += [folder / name for name, data in files.items() if _write(folder / name, data)]
     overviews = read_overviews(out)
     drawn = drawn_comparisons(out)
@@ -146,11 +147,6 @@ def recorded_files(path: Path, players: bool = False) -> tuple[str, dict[PurePos
             for file in sorted((path / "figures").glob("*.png"))
         },
     }
-    if players:
-        from experiments.finished_run import open_run
-        from experiments.players import packed
-
-        files[PurePosixPath(PLAYERS)] = packed(open_run(path))
     text = report.read_text(encoding="utf-8")
     used = _size(files) + len(text.encode())
     if used > LIMIT_BYTES:
@@ -164,6 +160,11 @@ def recorded_files(path: Path, players: bool = False) -> tuple[str, dict[PurePos
         if file.is_file() and used + file.stat().st_size <= LIMIT_BYTES:
             files[PurePosixPath("figures", "episodes", file.name)] = file.read_bytes()
             used += file.stat().st_size
+    if players:
+        from experiments.finished_run import open_run
+        from experiments.players import packed
+
+        files[PurePosixPath(PLAYERS)] = packed(open_run(path, PLAYER_STAGES))
     files[PurePosixPath("report.md")] = without_missing_links(text, files).encode()
     return results["environment"], files
 
@@ -237,7 +238,7 @@ def _size(files: Mapping[PurePosixPath, bytes]) -> int:
     return sum(len(data) for data in files.values())
 
 
-def _stale_pictures(folder: Path, files: Mapping[PurePosixPath, bytes]) -> list[Path]:
+def _stale_files(folder: Path, files: Mapping[PurePosixPath, bytes]) -> list[Path]:
     """Pictures of an earlier record that the new one does not have."""
     return [
         file

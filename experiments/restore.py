@@ -10,21 +10,22 @@ of one's own (python -m experiments.run).
 """
 
 import dataclasses
-import json
+import shutil
+import tempfile
+from collections.abc import Mapping
 from pathlib import Path
 from typing import Annotated, Any
 
 import tyro
 from rich.console import Console
 
-from experiments import devices
-from experiments.compared import COMPARED, PLAYERS, STAGE
+from experiments import devices, players, report
+from experiments.compared import COMPARED, PLAYER_STAGES, PLAYERS, STAGE
+from experiments.configs import RunConfig
 from experiments.errors import UserError, as_user_error, main_guard
 from experiments.run_all import default_path
 from experiments.run_folder import RunFolder
-
-RESTORED = ("partners", "best_responses", "task_language")
-"""The stages that a record's players stand for."""
+from experiments.stages import Run
 
 
 @dataclasses.dataclass(frozen=True)
@@ -59,34 +60,52 @@ def restore(record: Path, out: Path | None = None) -> Path:
         The run folder.
 
     Raises:
-        UserError: there are no players, they do not fit this version, or `out` exists.
+        UserError: there are no players, they do not fit this version or the results beside them,
+            or `out` exists.
     """
-    from experiments import players, report
+    from experiments.figures.reading import read_runs
     from experiments.finished_run import configuration_from
-    from experiments.stages import Run
 
     arrays, texts = players.read(record / PLAYERS)
-    file = record / "results.json"
-    if not file.is_file():
-        raise UserError(f"{file} is missing; name a record made by python -m experiments.record")
-    results = json.loads(file.read_text(encoding="utf-8"))
+    (results,) = read_runs((record,))
     with as_user_error():
         config = configuration_from(record, texts["config"])
+    players.expect_same_run(record, arrays, config, results)
     path = out or default_path(config.environment, config.preset, config.seed)
     if out is None:
         path = path.with_name(f"{path.name}-recorded")
     if path.exists():
         raise UserError(f"{path} is there already; remove it, or name another folder with --out")
+    path.parent.mkdir(parents=True, exist_ok=True)
+    with tempfile.TemporaryDirectory(dir=path.parent) as temporary:
+        made = Path(temporary) / path.name
+        _fill(made, config, record, arrays, texts, results)
+        made.rename(path)
+    return path
+
+
+def _fill(
+    path: Path,
+    config: RunConfig,
+    record: Path,
+    arrays: Mapping[str, Any],
+    texts: Mapping[str, Any],
+    results: dict[str, Any],
+) -> None:
+    """Makes the run folder of a record."""
     with RunFolder.write(path, config) as folder:
+        folder.mark_as_recorded(record.as_posix())
         players.unpack_into(Run(config, folder), arrays, texts)
         for stage, metrics in methods_of(results).items():
             folder.finish_stage(stage, metrics)
         folder.write_json("results.json", results)
-        for stage in RESTORED:
+        for stage in PLAYER_STAGES:
             folder.finish_stage(stage, {})
+        episodes = record / "figures" / "episodes"
+        if episodes.is_dir():
+            shutil.copytree(episodes, path / "figures" / "episodes")
         report.write_report(results, path)
         folder.finish_stage("report", {})
-    return path
 
 
 def methods_of(results: dict[str, Any]) -> dict[str, dict[str, Any]]:

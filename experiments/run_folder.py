@@ -5,6 +5,7 @@ config.json     the configuration; a run is continued only with the same one
 results.json    what every figure and the report are drawn from
 figures/        and report.md
 log.jsonl       one event a line
+recorded.json   only in a run that was made of a record: which one
 tensorboard/    the same scalars for TensorBoard
 """
 
@@ -14,7 +15,7 @@ import fcntl
 import json
 import os
 import time
-from collections.abc import Iterator, Mapping
+from collections.abc import Iterable, Iterator, Mapping
 from pathlib import Path
 from typing import Any
 
@@ -23,6 +24,7 @@ import numpy as np
 from experiments.errors import UserError
 
 _CONFIGURATION, _METRICS, _LOG, _LOCK = "config.json", "metrics.json", "log.jsonl", ".lock"
+_RECORDED = "recorded.json"
 
 
 class RunFolder:
@@ -83,12 +85,7 @@ class RunFolder:
                 f"{path} {what}; make a run with python -m experiments.run --out {path}"
             )
         folder = cls(path, _read_configuration(path), lock=None)
-        for stage in stages:
-            if not folder.stage_done(stage):
-                raise UserError(
-                    f"the run in {path} is unfinished: its stage '{stage}' is not done; continue "
-                    "it with the command that began it"
-                )
+        folder.expect_stages(stages)
         return folder
 
     def __enter__(self) -> "RunFolder":
@@ -116,6 +113,36 @@ class RunFolder:
     def stage_done(self, stage: str) -> bool:
         """Whether `finish_stage` was called for the stage, in this process or an earlier one."""
         return (self.path / stage / _METRICS).is_file()
+
+    def expect_stages(self, stages: Iterable[str]) -> None:
+        """Checks that stages are finished.
+
+        Raises:
+            UserError: one of them is not.
+        """
+        for stage in stages:
+            if self.stage_done(stage):
+                continue
+            if self.recorded_in is not None:
+                raise UserError(
+                    f"the run in {self.path} was made of the record {self.recorded_in}, which has "
+                    f"players and results only and no '{stage}'; make a run of your own with "
+                    "python -m experiments.run"
+                )
+            raise UserError(
+                f"the run in {self.path} is unfinished: its stage '{stage}' is not done; continue "
+                "it with the command that began it"
+            )
+
+    @property
+    def recorded_in(self) -> str | None:
+        """The record that the run was made of; None for a run of one's own."""
+        there = (self.path / _RECORDED).is_file()
+        return self.read_json(_RECORDED)["record"] if there else None
+
+    def mark_as_recorded(self, record: str) -> None:
+        """Notes that the run is made of a record, and is not to be trained further."""
+        self.write_json(_RECORDED, {"record": record})
 
     def finish_stage(self, stage: str, metrics: Mapping[str, Any]) -> None:
         """Records that everything that the stage makes is written; its metrics are the mark."""

@@ -19,7 +19,7 @@ from experiments.summary import (
 
 ADAPTIVE = "Adaptive Ego"
 WITHOUT_MEMORY = ("General Ego (MLP)", "Instructed Ego (MLP)")
-"""The egos of `COMPARISONS`, trained for longer."""
+"""The egos of `COMPARISONS`, in their order, trained with the budget of a comparison."""
 EGOS = (
     *("General Ego", "Instructed Ego", ADAPTIVE),
     *WITHOUT_MEMORY,
@@ -60,17 +60,20 @@ class Standing(NamedTuple):
 
 def compared(runs: Iterable[Results]) -> list[str]:
     """The methods of Fig. 3: Haland, the universal egos, then any others that are not ours."""
-    found = dict.fromkeys(name for run in runs for name in ordered_methods(run))
-    egos = universal_egos(found)
-    others = [name for name in found if name not in (HEADLINE, *_OWN, *ABLATIONS, *EGOS)]
-    return [HEADLINE, *egos, *others]
+    measured, egos = {}, set()
+    for run in runs:
+        measured |= dict.fromkeys(ordered_methods(run))
+        egos.update(universal_egos(run))
+    others = [name for name in measured if name not in (HEADLINE, *_OWN, *ABLATIONS, *EGOS)]
+    return [HEADLINE, *(name for name in EGOS if name in egos), *others]
 
 
-def universal_egos(measured: Iterable[str]) -> list[str]:
-    """The universal egos among methods; of the same kind, only those that learnt longest."""
-    found = set(measured)
-    if found.issuperset(WITHOUT_MEMORY):
-        found.difference_update(COMPARISONS)
+def universal_egos(run: Results) -> list[str]:
+    """The universal egos that were measured; of the same kind, only those that learnt longest."""
+    found, steps = set(run["methods"]), _steps(run)
+    for shorter, longer in zip(COMPARISONS, WITHOUT_MEMORY, strict=True):
+        if longer in found and steps.get(longer, 0) >= steps.get(shorter, 0):
+            found.discard(shorter)
     return [name for name in EGOS if name in found]
 
 
@@ -126,7 +129,7 @@ class Gain(NamedTuple):
 
 def gain(run: Results) -> Gain | None:
     """Haland's gain in a run; None where no universal ego was measured."""
-    others = universal_egos(run["methods"])
+    others = universal_egos(run)
     if not others or HEADLINE not in run["methods"]:
         return None
     ours = returns(run, HEADLINE).mean()
@@ -149,12 +152,15 @@ def improvement(gains: Iterable[Gain | None]) -> Gain | None:
 
 def improvement_in_words(gains: Iterable[Gain | None]) -> str:
     """The same in a sentence; empty where there is nothing to say."""
-    more = improvement(gains)
-    if more is None or np.isnan(more.best):
+    known = [one for one in gains if one is not None and np.isfinite(one.best)]
+    more = improvement(known)
+    if more is None:
         return ""
+    counted = f"{len(known)} environment{'s' * (len(known) != 1)}"
     return (
-        f"Haland earns {more.best:+.1%} beside the best universal ego of each environment, "
-        f"{more.each[0]:+.1%} beside each of them, on average (the paper states +89.64%)."
+        f"In mean return Haland earns {more.best:+.1%} beside the best universal ego of each "
+        f"environment, {more.each[0]:+.1%} beside each of them, on average over {counted} (the "
+        "paper states +89.64%)."
     )
 
 

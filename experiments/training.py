@@ -4,8 +4,9 @@ Between two pieces the state may be saved; what is computed does not depend on w
 happens, so a resumed run ends with the results of an uninterrupted one.
 """
 
+import itertools
 import time
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from pathlib import Path
 from typing import Any
 
@@ -22,6 +23,7 @@ from haland_jax.ppo import PPOConfig
 
 SECONDS_BETWEEN_CHECKPOINTS = 20.0
 UPDATES_PER_PIECE = 25
+CURVE_POINTS = 40
 Program = Callable[..., tuple[Any, dict[str, jax.Array]]]
 """Does some updates of a population: state, and whatever else it takes -> state, metrics."""
 
@@ -112,8 +114,8 @@ def train_in_pieces(
         report: called with the updates done and the mean return.
         stage: for messages.
         by_member: whatever else the program takes, leading axis [member].
-        updates_per_piece: updates of each member in a piece; `UPDATES_PER_PIECE` by default. Where
-            members take turns (`population.turns`), it is rounded down to whole rounds of them.
+        updates_per_piece: updates of each member in a piece; `UPDATES_PER_PIECE` by default, which
+            is rounded down to whole rounds where members take turns (`population.turns`).
         between: what happens to the state between two pieces, if anything.
 
     Returns:
@@ -130,11 +132,13 @@ def train_in_pieces(
     state = share_out(state)
     groups = turns(members, len(jax.devices()))
     rounds = sum(len(group) for group in groups) // members
+    if updates_per_piece is not None and updates_per_piece % rounds:
+        groups, rounds = [np.arange(members)], 1
     programs: dict[int, Program] = {}
     done = int(np.asarray(state.update)[0])
     while done < config.num_updates:
         size = min(updates_per_piece or UPDATES_PER_PIECE, config.num_updates - done)
-        # What is less than a round at the end is done by all members at once.
+        # What is less than a round is done by all members at once.
         taken, each = (groups, rounds) if size >= rounds else ([np.arange(members)], 1)
         size -= size % each
         if size // each not in programs:
@@ -149,6 +153,25 @@ def train_in_pieces(
             state = share_out(between(state))
         saver.save_if_due({"state": state, "returns": returns})
     return state, returns
+
+
+def curves_of(
+    config: PPOConfig, names: Sequence[str], returns: np.ndarray
+) -> dict[str, np.ndarray | dict[str, np.ndarray]]:
+    """Learning curves for results.json, averaged to at most `CURVE_POINTS` points.
+
+    Args:
+        config: how the players learnt.
+        names: of the kinds of players.
+        returns: of the training games, [update, kind * seed].
+    """
+    points = np.linspace(0, len(returns), min(CURVE_POINTS, len(returns)) + 1).astype(int)
+    smooth = np.array([returns[a:b].mean(axis=0) for a, b in itertools.pairwise(points)])
+    curves = np.split(smooth.T, len(names))  # [seed, point] each
+    return {
+        "curve_steps": points[1:] * config.steps_per_update,
+        "curve_returns": dict(zip(names, curves, strict=True)),
+    }
 
 
 def in_turns(

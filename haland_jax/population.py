@@ -15,6 +15,8 @@ import numpy as np
 from jax.core import Tracer
 from jax.sharding import Mesh, NamedSharding, PartitionSpec
 
+WORTH_TURNS = 0.1
+"""Share of copies from which on members take turns; each turn moves their states."""
 Population = Any
 """A pytree whose leaves have the leading axis [member]."""
 
@@ -93,10 +95,12 @@ def turns(members: int, devices: int) -> list[np.ndarray]:
 
     Returns:
         Members of each group, int [member of the group]; one group of all where the devices
-        divide the population, or are more than its members.
+        divide the population or are more than its members, or where filling it up with copies
+        costs less than `WORTH_TURNS` of the computation.
     """
     size = members - members % devices
-    if size in (0, members):
+    missing = -members % devices
+    if size == 0 or missing < WORTH_TURNS * (members + missing):
         return [np.arange(members)]
     groups = members // math.gcd(members, size)
     return [np.arange(first, first + size) % members for first in range(0, groups * size, size)]

@@ -108,6 +108,7 @@ def test_the_improvement_by_hand():
     assert found.each == pytest.approx((1.75,))
     said = standing.improvement_in_words(map(standing.gain, runs))
     assert "+50.0% beside the best" in said
+    assert "over 2 environments" in said
     assert "+175.0% beside each" in said
     # Beside an ego that loses there is no share: it is left out, and nothing is said of it alone.
     losing = standing.gain(run(5.0, 4.0, -1.0))

@@ -72,6 +72,7 @@ def test_turns_are_fair_and_devices_share_each_group(members, devices):
 
 def test_three_members_on_two_devices():
     assert [group.tolist() for group in turns(3, 2)] == [[0, 1], [2, 0], [1, 2]]
+    assert len(turns(49, 2)) == 1, "one copy among fifty is cheaper than turns"
 
 
 def test_donated_arguments_are_consumed_and_others_are_not():

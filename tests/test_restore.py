@@ -9,11 +9,10 @@ import numpy as np
 import pytest
 from refused_command import refused
 
-from experiments import compare, record, restore
-from experiments.compared import PLAYERS
+from experiments import compare, pipeline, players, record, restore
+from experiments.compared import PLAYER_STAGES, PLAYERS
 from experiments.errors import UserError
 from experiments.finished_run import open_run
-from experiments.restore import RESTORED
 from experiments.stages import load_archive, load_population, load_task_language
 from haland_jax import partners
 
@@ -44,7 +43,7 @@ def assert_near(one, two):
 
 @pytest.mark.slow
 def test_partners_and_best_responses_are_those_of_the_run(recorded, restored):
-    was, now = (open_run(path, RESTORED) for path in (recorded[0], restored))
+    was, now = (open_run(path, PLAYER_STAGES) for path in (recorded[0], restored))
     assert now.config == was.config
     before, after = load_population(was), load_population(now)
     for name in ("train_index", "held_out_index", "known_index", "joint_returns"):
@@ -73,30 +72,49 @@ def test_a_method_joins_the_recorded_ones(recorded, restored, tmp_path):
         EXAMPLE.read_text().replace("Retrieval", "Mine").replace('"retrieval"', '"mine"')
     )
     results = compare.measure(restored, (), added=mine)
-    for name, by_style in was["methods"].items():
-        assert results["methods"][name] == by_style, "the recorded methods stay"
-    assert {"Retrieval", "Mine"} <= set(results["descriptions"])
-    # The same best responses with the same partners, in other games.
-    means = [
-        np.mean([np.mean(style["returns"]) for style in results["methods"][name].values()])
-        for name in ("Retrieval", "Mine")
-    ]
-    assert np.isfinite(means).all()
+    assert results["methods"].pop("Mine").keys() == set(was["styles"])
+    assert set(results["compared"].pop("mine")["by_ego"]) == {"Mine"}
+    del results["descriptions"]["Mine"]
+    assert results == was, "what was recorded stays"
     assert "| Mine |" in (restored / "report.md").read_text()
+    gif = f"figures/episodes/{was['styles'][0]}.gif"
+    assert (restored / gif).read_bytes() == (recorded[1] / gif).read_bytes()
 
 
 @pytest.mark.slow
 def test_what_a_record_does_not_hold_is_refused(capsys, monkeypatch, recorded, restored, tmp_path):
-    with pytest.raises(
-        UserError, match=r"'no-vae' is Haland without a part, and the run in .* has no"
+    for ask in (
+        lambda: compare.measure(restored, ("no-vae",)),
+        lambda: pipeline.run_pipeline(open_run(restored, PLAYER_STAGES).config, restored),
     ):
-        compare.measure(restored, ("no-vae",))
+        with pytest.raises(
+            UserError, match=r"was made of the record .* and no 'universal'; make a"
+        ):
+            ask()
     line = refused(capsys, monkeypatch, restore, recorded[1], "--out", restored)
     assert "is there already; remove it" in line
     line = refused(capsys, monkeypatch, restore, tmp_path)
     assert "players.safetensors is missing; name a record that has players" in line
-    damaged = Path(shutil.copytree(recorded[1], tmp_path / "damaged"))
-    (damaged / PLAYERS).write_bytes(b"nothing")
-    line = refused(capsys, monkeypatch, restore, damaged, "--out", tmp_path / "run")
-    assert "is damaged" in line
-    assert not (tmp_path / "run").exists()
+    results = json.loads((recorded[1] / "results.json").read_text())
+    results["partners"]["joint_returns"][results["styles"][0]][0] += 1.0
+    for name, content, said in (
+        (PLAYERS, b"nothing", "is damaged"),
+        ("results.json", b"nothing", "results.json is damaged"),
+        ("results.json", json.dumps(results).encode(), "has the players of another run"),
+    ):
+        bad = Path(shutil.copytree(recorded[1], tmp_path / "bad", dirs_exist_ok=True))
+        (bad / name).write_bytes(content)
+        line = refused(capsys, monkeypatch, restore, bad, "--out", tmp_path / "run")
+        assert said in line
+        assert not (tmp_path / "run").exists()
+
+
+def test_half_precision_is_for_policies_that_fit_into_it():
+    policy = np.array([[0.1, 2.0], [300.0, -4.0]], np.float32)
+    assert players._stored("partners/kernel", policy, False).dtype == np.float16
+    for name, array, exact in (
+        ("partners/kernel", policy, True),
+        ("partners/kernel", policy * 1000, False),
+        ("language/by_seed", policy, False),
+    ):
+        np.testing.assert_array_equal(players._stored(name, array, exact), array)

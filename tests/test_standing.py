@@ -51,8 +51,21 @@ def test_steps_are_held_against_those_of_all_best_responses():
 
 def test_of_egos_of_the_same_kind_those_that_learnt_longest_count():
     shorter, longer = (UNIVERSAL, UNIVERSAL_WITH_LABEL), standing.WITHOUT_MEMORY
-    assert standing.universal_egos(["FCP", *shorter, longer[0]]) == [longer[0], "FCP", *shorter]
-    assert standing.universal_egos(["FCP", *shorter, *longer]) == [*longer, "FCP"]
+
+    def run(steps, *methods):
+        trained = {"by_ego": dict.fromkeys(longer), "steps": steps}
+        return {
+            "methods": dict.fromkeys((HEADLINE, "FCP", *shorter, *methods)),
+            "oracle": {},
+            "universal": {"steps": 100, "best_response_steps": 400},
+            "compared": {"universal-mlp": trained},
+        }
+
+    assert standing.universal_egos(run(400, *longer)) == [*longer, "FCP"]
+    assert standing.universal_egos(run(50, *longer)) == [*longer, "FCP", *shorter]
+    assert standing.universal_egos(run(400)) == ["FCP", *shorter]
+    both = standing.compared([run(400, *longer), run(400)])
+    assert both == [HEADLINE, *longer, "FCP", *shorter], "the second run has nothing longer"
 
 
 def test_nothing_to_compare():

@@ -90,8 +90,9 @@ def count(updates: int, state: Counter, weight: jax.Array):
 
 
 @pytest.mark.parametrize("members", [2, 3, 5])
-def test_members_that_take_turns_end_as_they_would_side_by_side(tmp_path, members):
+def test_members_that_take_turns_end_as_they_would_side_by_side(monkeypatch, tmp_path, members):
     """Five members take turns in groups of four, each of them four times in a round."""
+    monkeypatch.setattr(training, "UPDATES_PER_PIECE", 6)
     config, sizes = dataclasses.replace(CONFIG, total_steps=11 * CONFIG.steps_per_update), []
 
     def compiled(updates):
@@ -113,7 +114,6 @@ def test_members_that_take_turns_end_as_they_would_side_by_side(tmp_path, member
         lambda done, metrics: None,
         "counting",
         by_member=(weights,),
-        updates_per_piece=6,
     )
     drawn = np.array(
         [
@@ -132,6 +132,58 @@ def test_members_that_take_turns_end_as_they_would_side_by_side(tmp_path, member
             5: [(4, 1)] * 5 + [(4, 1)] * 5 + [(5, 3)],
         }[members]
     )
+
+
+def test_members_that_take_turns_go_on_where_they_were(monkeypatch, tmp_path):
+    config = dataclasses.replace(CONFIG, total_steps=10 * CONFIG.steps_per_update)
+
+    def run(path, die_after=None):
+        reported = []
+
+        def report(done, metrics):
+            reported.append(done)
+            if done == die_after:
+                raise Killed
+
+        state, returns = training.train_in_pieces(
+            config,
+            Counter(jnp.zeros(3, jnp.int32), jax.random.split(jax.random.key(3), 3), jnp.zeros(3)),
+            lambda updates: over_population(partial(count, updates), donate=(0,)),
+            training.Saver(path),
+            report,
+            "counting",
+            by_member=(jnp.arange(3.0),),
+        )
+        return state.total, returns, reported
+
+    monkeypatch.setattr(training, "UPDATES_PER_PIECE", 4)
+    monkeypatch.setattr(training, "SECONDS_BETWEEN_CHECKPOINTS", 0.0)
+    *whole, _ = run(tmp_path / "whole")
+    with pytest.raises(Killed):
+        run(tmp_path / "resumed", die_after=8)
+    *resumed, reported = run(tmp_path / "resumed")
+    assert reported == [8, 10]
+    assert_alike(resumed, whole)
+
+
+def test_pieces_of_a_given_size_are_kept_where_turns_would_change_them(tmp_path):
+    sizes = []
+
+    def compiled(updates):
+        sizes.append(updates)
+        return over_population(partial(count, updates), donate=(0,))
+
+    training.train_in_pieces(
+        dataclasses.replace(CONFIG, total_steps=10 * CONFIG.steps_per_update),
+        Counter(jnp.zeros(3, jnp.int32), jax.random.split(jax.random.key(3), 3), jnp.zeros(3)),
+        compiled,
+        training.Saver(tmp_path),
+        lambda done, metrics: None,
+        "counting",
+        by_member=(jnp.arange(3.0),),
+        updates_per_piece=5,
+    )
+    assert sizes == [5], "not four updates in two turns"
 
 
 def test_pairs_that_change_partners_go_on_with_the_partners_they_had(monkeypatch, tmp_path):

@@ -93,7 +93,10 @@ class Given:
 
     @property
     def best_responses(self) -> Player:
-        """The run's best responses to the partners of each style, leading axes [style, seed]."""
+        """The run's best responses to the partners of each style, leading axes [style, seed].
+
+        In a run that was made of a record only their actors are known; the rest is NaN.
+        """
         return load_archive(self.run).egos
 
     @property

@@ -7,9 +7,8 @@ import jax
 import jax.numpy as jnp
 
 from experiments.methods.base import Given, MakeEgo, Told, Trained
-from experiments.methods.universal import curves_of
 from experiments.stages import Run
-from experiments.training import train_population
+from experiments.training import curves_of, train_population
 from experiments.worth import steps_in_words
 from haland_jax import checkpoint, self_play
 from haland_jax.learner import TrainState
@@ -148,7 +147,7 @@ class FictitiousCoPlay:
             given.saver(f"pool_{config.num_updates}_updates"),
             given.task.update,
             "the pool of fictitious co-play",
-            updates_per_piece=min(25, max(1, config.num_updates // 20)),
+            updates_per_piece=min(24, max(1, config.num_updates // 20)),
             between=keep_middle,
         )
         moments = (beginners, checkpoint.restore(middle, beginners), players.partner.actor)

@@ -1,20 +1,18 @@
 """Universal egos: the paper's, with a memory (App. C.3), and the same without one.
 
-The paper's General, Instructed and Adaptive Ego remember; with as many steps they take ten times as
-long as egos without a memory, some of which earn more.
+The paper's General, Instructed and Adaptive Ego remember, which makes their steps several times as
+long as those of egos without a memory.
 """
 
 import dataclasses
-import itertools
 
 import jax
-import numpy as np
 
 from envs.labelled import Labelled
 from experiments.configs import RunConfig
 from experiments.methods.base import Given, MakeEgo, Told, Trained
 from experiments.stages import Run
-from experiments.training import train_in_pieces, train_population
+from experiments.training import curves_of, train_in_pieces, train_population
 from experiments.worth import steps_in_words
 from haland_jax import recurrent_ppo, universal
 from haland_jax.networks import Policy
@@ -24,7 +22,6 @@ from haland_jax.rollout import Agent
 from haland_jax.universal import TOLD_NOTHING, TOLD_THE_STYLE
 
 GENERAL_MLP, INSTRUCTED_MLP = f"{GENERAL} (MLP)", f"{INSTRUCTED} (MLP)"
-CURVE_POINTS = 40
 KNOWS = {
     GENERAL: "told nothing",
     INSTRUCTED: "told the style",
@@ -77,7 +74,7 @@ class RecurrentEgos:
         steps = training.num_updates * training.steps_per_update
         what = "one ego with a memory for all styles, {}, " + f"{steps_in_words(steps)} steps"
         return Trained(
-            egos={name: in_turn(agents, given.seeds) for name, agents in egos.items()},
+            egos={name: one_after_another(agents, given.seeds) for name, agents in egos.items()},
             descriptions={name: what.format(knows) for name, knows in KNOWS.items()},
             steps=steps,
             notes=curves_of(training, VARIANTS, returns),
@@ -85,7 +82,7 @@ class RecurrentEgos:
 
 
 class FeedForwardEgos:
-    """A General and an Instructed Ego without a memory: the run's universal egos, for longer."""
+    """A General and an Instructed Ego without a memory: the run's universal egos, for `steps`."""
 
     budgeted = True
 
@@ -118,7 +115,7 @@ class FeedForwardEgos:
         what = "one ego without a memory for all styles, {}, " + f"{steps_in_words(steps)} steps"
         told = {GENERAL_MLP: KNOWS[GENERAL], INSTRUCTED_MLP: KNOWS[INSTRUCTED]}
         return Trained(
-            egos={name: in_turn(actors, given.seeds) for name, actors in egos.items()},
+            egos={name: one_after_another(actors, given.seeds) for name, actors in egos.items()},
             descriptions={name: what.format(knows) for name, knows in told.items()},
             steps=steps,
             notes=curves_of(training, tuple(told), returns),
@@ -128,35 +125,7 @@ class FeedForwardEgos:
         return dataclasses.replace(config.universal.training, total_steps=steps)
 
 
-def curves_of(
-    training: PPOConfig, names: tuple[str, ...], returns: np.ndarray
-) -> dict[str, np.ndarray | dict[str, np.ndarray]]:
-    """Learning curves for results.json.
-
-    Args:
-        training: how the egos learnt.
-        names: of the kinds of egos.
-        returns: of the training games, [update, kind * seed].
-    """
-    points = curve_points(len(returns))
-    curves = np.split(smooth(returns, points), len(names))
-    return {
-        "curve_steps": points[1:] * training.steps_per_update,
-        "curve_returns": dict(zip(names, curves, strict=True)),
-    }
-
-
-def curve_points(updates: int) -> np.ndarray:
-    """Updates between which a learning curve is averaged, with 0 and the last one."""
-    return np.linspace(0, updates, min(CURVE_POINTS, updates) + 1).astype(int)
-
-
-def smooth(returns: np.ndarray, points: np.ndarray) -> np.ndarray:
-    """A learning curve [update, member] averaged between points, [member, point]."""
-    return np.array([returns[a:b].mean(axis=0) for a, b in itertools.pairwise(points)]).T
-
-
-def in_turn(egos: Policy | UniversalEgo, seeds: int) -> MakeEgo:
+def one_after_another(egos: Policy | UniversalEgo, seeds: int) -> MakeEgo:
     """Gives trained egos, leading axes [style, seed], one after the other."""
 
     def make(told: Told, key: jax.Array) -> Policy | Agent:

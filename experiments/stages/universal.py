@@ -1,21 +1,18 @@
 """Universal egos, which say how much knowing the style is worth."""
 
-import itertools
 from typing import Any
 
 import jax
-import numpy as np
 
 from envs.base import Environment
 from envs.labelled import Labelled
 from experiments.progress import StageProgress
 from experiments.stages.context import Run
 from experiments.stages.population import load_population
-from experiments.training import Saver, train_population
+from experiments.training import Saver, curves_of, train_population
 from haland_jax import checkpoint, partners, universal
 from haland_jax.partners import Player
 
-CURVE_POINTS = 40
 STAGE = "universal"
 
 
@@ -48,16 +45,10 @@ def train_universal_in(
         "universal egos",
     )
     checkpoint.save(run.path(stage, "egos"), players.ego)
-    points = np.linspace(0, len(returns), min(CURVE_POINTS, len(returns)) + 1).astype(int)
-    smooth = np.array([returns[a:b].mean(axis=0) for a, b in itertools.pairwise(points)])
-    curves = smooth.reshape(len(smooth), len(universal.VARIANTS), -1)  # [point, variant, seed]
     return {
         "steps": config.training.num_updates * config.training.steps_per_update,
         "seeds": config.seeds,
-        "curve_steps": points[1:] * config.training.steps_per_update,
-        "curve_returns": {
-            name: curves[:, index].T for index, name in enumerate(universal.VARIANTS)
-        },
+        **curves_of(config.training, universal.VARIANTS, returns),
     }
 
 
