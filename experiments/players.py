@@ -69,8 +69,8 @@ def packed(run: Run) -> bytes:
 def _stored(name: str, array: np.ndarray, exact: bool) -> np.ndarray:
     if exact or name.split("/")[0] not in _POLICIES:
         return array
-    half = array.astype(np.float16)
-    return half if np.isfinite(half).all() else array
+    fits = np.abs(array).max() <= np.finfo(np.float16).max
+    return array.astype(np.float16) if fits else array
 
 
 def read(file: Path) -> tuple[dict[str, Any], Mapping[str, Any]]:

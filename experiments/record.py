@@ -34,6 +34,8 @@ from experiments.run_folder import RunFolder
 
 OUT = Path("docs/results")
 LIMIT_BYTES = 4_000_000
+DIGITS = 7
+"""As many as single precision has."""
 EPISODES = 2
 COMPARING = ("figure_3", "figure_4", "figure_6a", "universal_learning", "table_1")
 """The paper's figures that show other methods."""
@@ -135,7 +137,7 @@ def recorded_files(path: Path, players: bool = False) -> tuple[str, dict[PurePos
         UserError: the run is unfinished, or its figures alone are larger than the limit.
     """
     folder = RunFolder.read(path, ("report",))
-    results = without_paths(folder.read_json("results.json"))
+    results = rounded(without_paths(folder.read_json("results.json")))
     report = path / "report.md"
     if not report.is_file():
         raise UserError(f"{report} is missing; delete {path / 'report'} and run again")
@@ -185,6 +187,15 @@ def without_paths(value: Any) -> Any:
     if isinstance(value, list):
         return [without_paths(item) for item in value]
     return Path(value).name if isinstance(value, str) and Path(value).is_absolute() else value
+
+
+def rounded(value: Any) -> Any:
+    """The results with numbers of `DIGITS` digits, which halves the file."""
+    if isinstance(value, dict):
+        return {key: rounded(item) for key, item in value.items()}
+    if isinstance(value, list):
+        return [rounded(item) for item in value]
+    return float(f"{value:.{DIGITS}g}") if isinstance(value, float) else value
 
 
 def read_overviews(out: Path) -> list[Overview]:

@@ -6,7 +6,7 @@ import envs
 from experiments.markdown import table
 from experiments.overview import Overview, number, percent
 from experiments.run_all import ALL, default_path
-from experiments.standing import Standing, improvement_in_words
+from experiments.standing import Standing, improvement_in_words, in_order
 from experiments.worth import steps_in_words
 
 AIM = 0.95
@@ -196,7 +196,7 @@ def beside_others(overviews: Sequence[Overview], picture: str) -> str:
     found = [row for row in overviews if row.shares]
     if not found:
         return ""
-    methods = list(dict.fromkeys(name for row in found for name in row.shares))
+    methods = in_order(name for row in found for name in row.shares)
     rows = [
         (method, *(str(row.shares[method]) if method in row.shares else "–" for row in found))
         for method in methods
@@ -217,7 +217,7 @@ def beside_others(overviews: Sequence[Overview], picture: str) -> str:
 
 def _budgets(found: Sequence[Overview]) -> str:
     """What the egos of other methods took to learn; empty where none learnt in games."""
-    methods = list(dict.fromkeys(name for row in found for name in row.steps))
+    methods = in_order(name for row in found for name in row.steps)
     if not methods:
         return ""
 

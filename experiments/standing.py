@@ -60,12 +60,20 @@ class Standing(NamedTuple):
 
 def compared(runs: Iterable[Results]) -> list[str]:
     """The methods of Fig. 3: Haland, the universal egos, then any others that are not ours."""
-    measured, egos = {}, set()
+    measured = {HEADLINE: None}
     for run in runs:
-        measured |= dict.fromkeys(ordered_methods(run))
-        egos.update(universal_egos(run))
-    others = [name for name in measured if name not in (HEADLINE, *_OWN, *ABLATIONS, *EGOS)]
-    return [HEADLINE, *(name for name in EGOS if name in egos), *others]
+        others = (name for name in ordered_methods(run) if name not in (*_OWN, *ABLATIONS, *EGOS))
+        measured |= dict.fromkeys([*universal_egos(run), *others])
+    return in_order(measured)
+
+
+def in_order(methods: Iterable[str]) -> list[str]:
+    """Methods as tables and figures show them: Haland, universal egos, others, ablations."""
+    found = dict.fromkeys(methods)
+    first, last = (HEADLINE, *EGOS), ABLATIONS
+    others = [name for name in found if name not in (*first, *last)]
+    known = [[name for name in names if name in found] for names in (first, last)]
+    return [*known[0], *others, *known[1]]
 
 
 def universal_egos(run: Results) -> list[str]:

@@ -277,6 +277,15 @@ def test_a_second_environment_joins_and_a_new_run_replaces_the_old(tmp_path, rea
     assert json.loads((out / KITCHEN / "results.json").read_text())["seed"] == 5
 
 
+def test_numbers_are_kept_with_the_digits_of_single_precision(tmp_path):
+    run = finished(tmp_path / "run", games=3, cross_play=[[1 / 3, 2.0], [12345.678901, 0.0]])
+    _, files = record.recorded_files(run)
+    kept = json.loads(files[PurePosixPath("results.json")])
+    assert kept["cross_play"] == [[0.3333333, 2.0], [12345.68, 0.0]]
+    assert kept["games"] == 3
+    assert isinstance(kept["games"], int)
+
+
 def test_records_that_the_readme_does_not_show_leave_it_alone(tmp_path, readme):
     out = tmp_path / "comparisons"
     changed = record.record([finished(tmp_path / "run")], out, None)

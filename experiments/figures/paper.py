@@ -25,6 +25,7 @@ from experiments.standing import ABLATIONS, ADAPTIVE, EGOS, Results, compared, e
 from experiments.summary import HEADLINE, ORACLE, mean, ratios, returns, shares, spread
 
 TRAINING = "Haland, training sentences"
+LEGEND_COLUMNS = 3
 _MARKERS = "osD^vPX*<>"
 """Of styles, so that they can be told apart in grey."""
 
@@ -51,7 +52,8 @@ def normalised_returns(runs: Sequence[Results]) -> Figure:
     groups: dict[str, Sequence[Results]] = {_short(run): [run] for run in runs}
     if len(runs) > 1:
         groups["all"] = runs
-    figure = new_figure(max(6.0, 1.7 * len(groups)), 3.6)
+    rows = -(-len(methods) // LEGEND_COLUMNS)
+    figure = new_figure(max(7.4, 1.7 * len(groups)), 3.0 + 0.2 * rows)
     axes = figure.add_subplot()
     fills = fills_of(methods)
     width = 0.84 / len(methods)
@@ -76,7 +78,7 @@ def normalised_returns(runs: Sequence[Results]) -> Figure:
     axes.grid(axis="y", color="#dddddd", linewidth=0.6)
     axes.set_ylabel("return / Oracle (interquartile mean, 95%)")
     if axes.containers:
-        figure.legend(loc="outside upper center", ncols=min(4, len(methods)), frameon=False)
+        figure.legend(loc="outside upper center", ncols=LEGEND_COLUMNS, frameon=False)
     return figure
 
 
@@ -162,8 +164,9 @@ def ablation_bars(results: Results) -> Figure:
 def universal_learning(results: Results) -> Figure:
     """Not in the paper: how the universal egos learnt, and whether they had learnt all they could.
 
-    Return of the training games, some of which start at a random moment, by environment steps of an
-    ego, a line a kind (mean over its seeds).
+    Return of training games by environment steps of an ego, a line a kind (mean over its seeds).
+    Games that start at a random moment, with soups half made, earn more, and grow fewer in the
+    second half.
     """
     figure = new_figure(6.4, 3.6)
     axes = figure.add_subplot()
@@ -178,6 +181,7 @@ def universal_learning(results: Results) -> Figure:
             )  # fmt: skip
     axes.set_xlabel("environment steps of an ego (millions)")
     axes.set_ylabel("return of training games")
+    axes.set_title("games that start at random moments earn more, and grow fewer", fontsize=8)
     axes.grid(axis="y", color="#dddddd", linewidth=0.6)
     axes.set_xlim(left=0)
     figure.legend(loc="outside right upper", frameon=False)
