@@ -7,6 +7,7 @@ from experiments.markdown import table
 from experiments.overview import Overview, number, percent
 from experiments.run_all import ALL, default_path
 from experiments.standing import Standing, improvement_in_words, in_order
+from experiments.summary import COMPARISONS, HEADLINE
 from experiments.worth import steps_in_words
 
 AIM = 0.95
@@ -193,7 +194,7 @@ def _sights(overviews: Sequence[Overview]) -> str:
 
 def beside_others(overviews: Sequence[Overview], picture: str) -> str:
     """Haland and all other methods by environment; empty where nothing was compared."""
-    found = [row for row in overviews if row.shares]
+    found = [row for row in overviews if set(row.shares) - {HEADLINE, *COMPARISONS}]
     if not found:
         return ""
     methods = in_order(name for row in found for name in row.shares)
