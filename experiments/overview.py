@@ -130,6 +130,7 @@ def overview(results: Mapping[str, Any]) -> Overview:
     machine = results.get("machine", {})
     rows = {row.method: row for row in summarise(results)}
     times, gates = results.get("times"), results.get("gates", {})
+    found = standings(results)
     return Overview(
         environment=results["environment"],
         preset=results["preset"],
@@ -159,14 +160,10 @@ def overview(results: Mapping[str, Any]) -> Overview:
         gates=len(gates),
         machine=_machine(machine),
         date=machine.get("date"),
-        shares=_shares(results),
-        steps={
-            one.method: (one.steps, one.budget)
-            for one in standings(results)
-            if one.steps is not None
-        },
+        shares=_shares(found),
+        steps={one.method: (one.steps, one.budget) for one in found if one.steps is not None},
         gain=gain(results),
-        best_ego=best_ego(results),
+        best_ego=best_ego(found),
         compared=_compared(results),
     )
 
@@ -181,8 +178,7 @@ def percent(value: float | None) -> str:
     return "–" if value is None else f"{value:.0%}"
 
 
-def _shares(results: Mapping[str, Any]) -> dict[str, Estimate]:
-    found = standings(results)
+def _shares(found: Sequence[Standing]) -> dict[str, Estimate]:
     haland = {HEADLINE: found[0].haland} if found else {}
     return haland | {one.method: one.share for one in found}
 

@@ -250,11 +250,12 @@ def _size(files: Mapping[PurePosixPath, bytes]) -> int:
 
 
 def _stale_files(folder: Path, files: Mapping[PurePosixPath, bytes]) -> list[Path]:
-    """Pictures of an earlier record that the new one does not have."""
+    """Pictures and players of an earlier record that the new one does not have."""
     return [
         file
-        for file in sorted((folder / "figures").rglob("*"))
-        if file.suffix in (".png", ".gif")
+        for file in (*sorted((folder / "figures").rglob("*")), folder / PLAYERS)
+        if file.is_file()
+        and file.suffix in (".png", ".gif", ".safetensors")
         and PurePosixPath(file.relative_to(folder).as_posix()) not in files
     ]
 

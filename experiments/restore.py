@@ -1,7 +1,8 @@
 """Makes a run of a record, to put further methods beside the recorded ones.
 
-    python -m experiments.restore docs/comparisons/overcooked/crossway
-    python -m experiments.compare runs/overcooked-crossway-quick-0-recorded --methods --add mine.py
+    python -m experiments.restore docs/comparisons/overcooked/diverse_orders
+    RUN=runs/overcooked-diverse_orders-quick-0-recorded
+    python -m experiments.compare $RUN --methods --add mine.py
 
 The run has the recorded players, partners to learn with and held-out ones, and the recorded
 results of all methods, so that a new one is compared with the very same partners and nothing needs
@@ -33,7 +34,7 @@ class Arguments:
     """Make a run of a record, to put further methods beside the recorded ones."""
 
     record: Annotated[Path, tyro.conf.Positional, tyro.conf.arg(metavar="RECORD")]
-    """Folder of a record with players, such as docs/comparisons/lbf/spread."""
+    """Folder of a record with players, such as docs/comparisons/overcooked/diverse_orders."""
     out: Annotated[Path | None, tyro.conf.arg(metavar="FOLDER")] = None
     """Run folder; runs/<environment>-<preset>-<seed>-recorded by default."""
 

@@ -117,9 +117,9 @@ def standings(results: Results) -> list[Standing]:
     return found
 
 
-def best_ego(results: Results) -> Standing | None:
+def best_ego(found: Iterable[Standing]) -> Standing | None:
     """The universal ego that earns most; None where none was measured."""
-    egos = [one for one in standings(results) if one.method in EGOS]
+    egos = [one for one in found if one.method in EGOS]
     return max(egos, key=lambda one: one.share.value, default=None)
 
 

@@ -14,6 +14,7 @@ from refused_command import refused
 
 import envs
 from experiments import configs, record, results_page
+from experiments.compared import PLAYERS
 from experiments.errors import UserError
 from experiments.overview import overview
 from experiments.run_folder import RunFolder
@@ -292,6 +293,15 @@ def test_records_that_the_readme_does_not_show_leave_it_alone(tmp_path, readme):
     assert out / "README.md" in changed
     assert readme.read_text() == README
     assert f"--out {out.as_posix()} --readme None\n" in (out / "README.md").read_text()
+
+
+def test_players_of_an_earlier_record_do_not_stay_beside_other_results(tmp_path):
+    out = tmp_path / "comparisons"
+    record.record([finished(tmp_path / "one")], out, None)
+    left = out / KITCHEN / PLAYERS
+    left.write_bytes(b"of the earlier run")
+    assert left in record.record([finished(tmp_path / "two", seed=1)], out, None)
+    assert not left.exists()
 
 
 def test_where_methods_were_compared_they_are_drawn(tmp_path):

@@ -43,7 +43,7 @@ def test_steps_are_held_against_those_of_all_best_responses():
     assert (found["Without VAE"].steps, found["Without VAE"].budget) == (None, None)
     assert found["Without VAE"].share == pytest.approx((0.1, 0.1, 0.1))
     assert found["Without VAE"].verdict == "ahead"
-    best = standing.best_ego(results)
+    best = standing.best_ego(standing.standings(results))
     assert best is not None
     assert best.method == UNIVERSAL, "ablations and others are no universal egos"
     assert best.verdict == "behind"
@@ -74,7 +74,7 @@ def test_nothing_to_compare():
     alone["methods"][HEADLINE] = {style: {"returns": [9.0]} for style in alone["styles"]}
     alone["oracle"] = {style: [10.0] for style in alone["styles"]}
     assert standing.standings(alone) == []
-    assert standing.best_ego(alone) is None
+    assert standing.best_ego(standing.standings(alone)) is None
 
 
 def test_report_and_page_name_the_best_universal_ego(tmp_path):
