@@ -10,7 +10,7 @@ from rich.table import Table
 
 from experiments.evaluate import measure
 from experiments.models import instructions_of
-from haland_jax import partners, policy_vae
+from haland_jax import policy_vae, rollout
 from haland_jax.pretrained import TrainedModel
 
 STATES = 256
@@ -77,7 +77,7 @@ def _divergence(
     held_out = jax.tree.map(lambda leaf: leaf[styles, :1], before.held_out_partners)
     visit = jax.jit(
         jax.vmap(
-            lambda key, ego, partner, style: partners.visited_observations(
+            lambda key, ego, partner, style: rollout.visited_observations(
                 env, key, ego, partner, style, num_kept=STATES
             )
         ),

@@ -8,7 +8,7 @@ from experiments.summary import COMPARISONS, METHODS
 
 NAMES = (
     *("universal", "universal-mlp", "self-play", "fcp"),
-    *("cgan-mlp", "cgan-unet", "no-translator", "no-vae", "no-fine-tuning"),
+    *("cgan-mlp", "cgan-unet", "no-translator", "no-vae", "no-vae-clean", "no-fine-tuning"),
 )
 """The methods that come with the project."""
 COMPARED = "compared"

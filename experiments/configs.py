@@ -31,6 +31,8 @@ class Adaptation:
         compression: the policy VAE's fit by preset, where the preset's is too short.
         universal_games: games in parallel of the universal egos by preset, where those of the
             preset cannot be shared by the partners in equal parts.
+        universal_start: steps of the universal egos by preset, where best responses start from
+            them too and the preset does not foresee it.
         training: settings of every training that differ; with `normalise` the policy VAE
             compresses normalised policies too.
     """
@@ -45,6 +47,7 @@ class Adaptation:
     refit_steps: Mapping[str, int] = dataclasses.field(default_factory=dict)
     compression: Mapping[str, FitConfig] = dataclasses.field(default_factory=dict)
     universal_games: Mapping[str, int] = dataclasses.field(default_factory=dict)
+    universal_start: Mapping[str, int] = dataclasses.field(default_factory=dict)
     training: Mapping[str, Any] = dataclasses.field(default_factory=dict)
 
 
@@ -52,8 +55,11 @@ _LONG_COMPRESSION = FitConfig(learning_rate=5e-3, steps=5000, warmup_steps=100)
 """The policy VAE's fit in recorded results."""
 
 ADAPTATIONS = {
+    # Pairs that begin at the same pot keep to it, and so do refits of their egos, beside partners
+    # that would serve both; an ego that has met all styles knows better.
+    "overcooked/center_pots": Adaptation(universal_start={"quick": 20_000_000}),
     # Both players must learn to give way.
-    "overcooked/crossway": Adaptation(length=1.7),
+    "overcooked/crossway": Adaptation(length=1.7, universal_start={"quick": 20_000_000}),
     # Pairs must learn to share the work in two rooms, and otherwise keep to the nearer pot: the
     # farther one pays some fifty steps after the first ingredient is put into it. `quick` has
     # fewer steps and is content with the nearer pot.
@@ -65,12 +71,14 @@ ADAPTATIONS = {
         training={"discount": 0.995},
     ),
     # Learnt within 200,000 steps; the target pays 1 where a soup pays 20. Others reach nearly all
-    # of it, so the last hundredth that an ego or its compression loses shows.
+    # of it, so the last hundredth that an ego or its compression loses shows: with partners that it
+    # has not met, an ego that has met all styles fails least.
     "lbf/spread": Adaptation(
         max_steps=50,
         length=0.4,
         refit_steps={"quick": 1_000_000},
         compression={"quick": _LONG_COMPRESSION},
+        universal_start={"quick": 10_000_000},
         training={"reward_scale": 2.0, "confined_until": 0.0},
     ),
     # Speeds of joints, and observations of several units. At the mouth all pairs succeed within
@@ -197,6 +205,11 @@ def _adapted(config: RunConfig) -> RunConfig:
     joint = dataclasses.replace(joint, total_steps=steps)
     normalised = change.training.get("normalise", compression.vae.normalised)
     games = change.universal_games.get(config.preset, universal.training.num_envs)
+    training = dataclasses.replace(universal.training, num_envs=games)
+    if config.preset in change.universal_start:
+        partners = dataclasses.replace(partners, universal_start=True)
+        steps = change.universal_start[config.preset]
+        training = dataclasses.replace(training, total_steps=steps)
     return dataclasses.replace(
         config,
         max_steps=min(config.max_steps, change.max_steps),
@@ -212,9 +225,7 @@ def _adapted(config: RunConfig) -> RunConfig:
             vae=dataclasses.replace(compression.vae, normalised=normalised),
             fit=change.compression.get(config.preset, compression.fit),
         ),
-        universal=dataclasses.replace(
-            universal, training=changed(universal.training, num_envs=games)
-        ),
+        universal=dataclasses.replace(universal, training=changed(training)),
     )
 
 
@@ -274,7 +285,8 @@ def smoke(environment: str, seed: int) -> RunConfig:
 def quick(environment: str, seed: int) -> RunConfig:
     """The whole method with three training and two held-out seeds a style.
 
-    `python -m experiments.run`; about a quarter of an hour on two CPU cores.
+    `python -m experiments.run`; about a quarter of an hour on two CPU cores, an hour in other
+    environments, where pairs take longer or best responses start from universal egos too.
     """
     config = RunConfig(
         environment=environment,

@@ -6,6 +6,13 @@ from pathlib import Path
 import jax
 
 
+def usable_cores() -> int:
+    """How many cores this process may use."""
+    if hasattr(os, "sched_getaffinity"):
+        return len(os.sched_getaffinity(0))
+    return os.cpu_count() or 1
+
+
 def prepare(*, cores: int | None = None) -> None:
     """Configures JAX; call it before the first computation.
 
@@ -17,10 +24,7 @@ def prepare(*, cores: int | None = None) -> None:
         cores: host devices to make; one for each core this process may use by default.
     """
     if cores is None:
-        usable = (
-            len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count()
-        )
-        cores = min(8, usable or 1)
+        cores = min(8, usable_cores())
     jax.config.update("jax_num_cpu_devices", cores)
     cache = Path(os.environ.get("XDG_CACHE_HOME", Path.home() / ".cache")) / "haland-jax"
     if not os.environ.get("JAX_COMPILATION_CACHE_DIR"):

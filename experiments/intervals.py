@@ -4,6 +4,12 @@ A mean over styles and seeds hangs on a few outliers, and with three to five see
 what another run would give. Recommended instead: the mean of the middle half of all scores, and an
 interval from scores drawn again, seeds with replacement within each style (or task), so that
 every style keeps its weight.
+
+Scores drawn again vary less than the population does, by (n - 1)/n where a style has n of them.
+With dozens that is nothing; with the two held-out partners a style of the preset `quick`, intervals
+would hold the truth in 78% of cases instead of 95%. So what is drawn is spread by sqrt(n/(n - 1))
+about its style's mean (Rao and Wu, 1988, with samples of the same size), and by what Student's t
+has more than the normal distribution, since the spread itself is estimated.
 """
 
 from collections.abc import Callable
@@ -17,7 +23,11 @@ CONFIDENCE = 0.95
 
 
 class Estimate(NamedTuple):
-    """A value, and the interval that holds it with 95% confidence."""
+    """A value, and its interval: of such intervals 95% hold what they are estimates of.
+
+    Styles are given, and not drawn; what varies is which partners (or people) of a style there
+    happened to be.
+    """
 
     value: float
     low: float
@@ -68,8 +78,21 @@ def _estimate(scores: np.ndarray, statistic: Callable[..., np.ndarray], seed: in
         raise ValueError("there are no scores; expected at least one finite number")
     value = float(statistic(np.concatenate(rows)))
     rng = np.random.default_rng(seed)
-    drawn = [rng.choice(row, (RESAMPLES, row.size)) for row in rows]
+    freedom = sum(row.size - 1 for row in rows)
+    drawn = [_drawn_again(rng, row, freedom) for row in rows]
     found = statistic(np.concatenate(drawn, axis=1), axis=1)
     tail = (1 - CONFIDENCE) / 2
     low, high = np.quantile(found, [tail, 1 - tail])
     return Estimate(value, float(low), float(high))
+
+
+def _drawn_again(rng: np.random.Generator, scores: np.ndarray, freedom: int) -> np.ndarray:
+    """Scores of one stratum, [resample, seed], spread as the module says."""
+    drawn = rng.choice(scores, (RESAMPLES, scores.size))
+    if scores.size == 1:
+        return drawn
+    upper = (1 + CONFIDENCE) / 2
+    wider = stats.t.ppf(upper, freedom) / stats.norm.ppf(upper)
+    wider *= np.sqrt(scores.size / (scores.size - 1))
+    centre = scores.mean()
+    return centre + wider * (drawn - centre)

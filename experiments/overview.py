@@ -8,7 +8,7 @@ import numpy as np
 
 from experiments.compared import COMPARED, NAMES
 from experiments.intervals import Estimate
-from experiments.standing import Gain, Standing, best_ego, gain, standings
+from experiments.standing import Gain, Standing, best_ego, gain, lowest, standings, without_memory
 from experiments.summary import (
     BEST_RESPONSE,
     HEADLINE,
@@ -48,8 +48,9 @@ class Overview:
         successes: share of the games that succeed with the Oracle and with Haland from test
             sentences; None where games only earn a return.
         accuracy: share of the test sentences that are translated into their own style.
-        universal: return of one ego for all styles, which is told nothing.
-        universal_with_label: return of one ego for all styles, which is told the style.
+        universal: return of the ego for all styles without a memory that learnt longest and is
+            told nothing.
+        universal_with_label: the same of the one that is told the style.
         diagonal: return of best responses with partners of their own style.
         off_diagonal: return of best responses with partners of the other styles.
         worth: what knowing the style is worth, in sentences; may be empty.
@@ -62,6 +63,7 @@ class Overview:
         date: day of the run, year-month-day.
         shares: by method that is compared with others, the interquartile mean of return / Oracle
             with its interval; Haland's first.
+        means: by the same methods, the mean of return / Oracle, and that of the lowest style.
         steps: by method whose egos learnt in games, environment steps of one of them and their
             share of the steps of all best responses together, where that is known.
         gain: how much more Haland earns than universal egos; None where none was measured.
@@ -97,6 +99,7 @@ class Overview:
     machine: str | None
     date: str | None
     shares: Mapping[str, Estimate]
+    means: Mapping[str, tuple[float, float]]
     steps: Mapping[str, tuple[int, float | None]]
     gain: Gain | None
     best_ego: Standing | None
@@ -131,6 +134,7 @@ def overview(results: Mapping[str, Any]) -> Overview:
     rows = {row.method: row for row in summarise(results)}
     times, gates = results.get("times"), results.get("gates", {})
     found = standings(results)
+    plain, told, _ = without_memory(results) or (UNIVERSAL, UNIVERSAL_WITH_LABEL, 0)
     return Overview(
         environment=results["environment"],
         preset=results["preset"],
@@ -147,10 +151,8 @@ def overview(results: Mapping[str, Any]) -> Overview:
         wrong_share=_share(results, WRONG),
         successes=_successes(results),
         accuracy=results.get("translator", {}).get("accuracy"),
-        universal=rows[UNIVERSAL].mean if UNIVERSAL in rows else None,
-        universal_with_label=(
-            rows[UNIVERSAL_WITH_LABEL].mean if UNIVERSAL_WITH_LABEL in rows else None
-        ),
+        universal=rows[plain].mean if plain in rows else None,
+        universal_with_label=rows[told].mean if told in rows else None,
         diagonal=diagonal,
         off_diagonal=off_diagonal,
         worth=worth_of_the_style(results),
@@ -161,6 +163,7 @@ def overview(results: Mapping[str, Any]) -> Overview:
         machine=_machine(machine),
         date=machine.get("date"),
         shares=_shares(found),
+        means=_means(results, found),
         steps={one.method: (one.steps, one.budget) for one in found if one.steps is not None},
         gain=gain(results),
         best_ego=best_ego(found),
@@ -181,6 +184,14 @@ def percent(value: float | None) -> str:
 def _shares(found: Sequence[Standing]) -> dict[str, Estimate]:
     haland = {HEADLINE: found[0].haland} if found else {}
     return haland | {one.method: one.share for one in found}
+
+
+def _means(results: Mapping[str, Any], found: Sequence[Standing]) -> dict[str, tuple[float, float]]:
+    if not found:
+        return {}
+    haland = ratios(results, HEADLINE)
+    others = {one.method: (one.mean, one.lowest) for one in found}
+    return {HEADLINE: (mean(haland), lowest(haland))} | others
 
 
 def _compared(results: Mapping[str, Any]) -> dict[str, list[str]]:

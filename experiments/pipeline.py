@@ -13,6 +13,7 @@ from experiments.machine import describe_machine
 from experiments.progress import RunProgress
 from experiments.run_folder import RunFolder
 from experiments.stages import STAGES, Run
+from haland_jax.universal import VARIANTS
 
 EVALUATION, REPORT = "evaluation", "report"
 NUM_METHODS = 8
@@ -84,8 +85,9 @@ def collect_results(run: Run) -> dict[str, Any]:
             for name in ("joint_returns", "kept_for_training", "kept_held_out")
         },
         "best_responses": {
-            name: metrics["best_responses"][name]
-            for name in ("starts", "start_returns", "kept_egos")
+            name: value
+            for name, value in metrics["best_responses"].items()
+            if name not in ("seconds", "oracle_candidate_returns")
         },
         "times": {name: values["seconds"] for name, values in metrics.items()},
         "machine": describe_machine(),
@@ -95,17 +97,21 @@ def collect_results(run: Run) -> dict[str, Any]:
 def _universal(run: Run, measured: dict[str, Any]) -> dict[str, Any]:
     """How the universal egos learnt, and what the best responses cost beside them.
 
-    They cost the pairs that they start from, those of held-out partners not among them, and their
-    refits.
+    They cost the pairs that they start from, those of held-out partners not among them, the
+    universal egos where some start from these, and their refits.
     """
     config = run.config.partners
     styles = len(run.env.style_names)
     pairs = styles * config.known_seeds * config.joint.num_updates * config.joint.steps_per_update
     starts = 2 if config.universal_start else 1
+    egos = len(VARIANTS) * measured["seeds"] if config.universal_start else 0
     refits = styles * starts * config.train_seeds
     refits *= config.refit.num_updates * config.refit.steps_per_update
     kept = ("steps", "seeds", "curve_steps", "curve_returns")
-    return {**{name: measured[name] for name in kept}, "best_response_steps": pairs + refits}
+    return {
+        **{name: measured[name] for name in kept},
+        "best_response_steps": pairs + egos * measured["steps"] + refits,
+    }
 
 
 def _totals(config: RunConfig) -> dict[str, int]:

@@ -63,7 +63,16 @@ def packed(run: Run) -> bytes:
         "events": json.dumps(list(language.event_names)),
         "dropped": json.dumps(list(language.dropped_event_names)),
     }
-    return safetensors.numpy.save(flat, about)
+    return _in_order(safetensors.numpy.save(flat, about))
+
+
+def _in_order(file: bytes) -> bytes:
+    """A safetensors file whose texts are sorted, so that the same players make the same file."""
+    end = 8 + int.from_bytes(file[:8], "little")
+    header = json.loads(file[8:end])
+    header["__metadata__"] = dict(sorted(header["__metadata__"].items()))
+    text = json.dumps(header, separators=(",", ":"), ensure_ascii=False).encode()
+    return file[:8] + text.ljust(end - 8) + file[end:]
 
 
 def _stored(name: str, array: np.ndarray, exact: bool) -> np.ndarray:

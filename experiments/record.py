@@ -29,14 +29,18 @@ from rich.console import Console
 from experiments import results_page
 from experiments.compared import COMPARED, PLAYER_STAGES, PLAYERS
 from experiments.errors import UserError, main_guard
-from experiments.overview import Overview, overview
+from experiments.overview import overview
+from experiments.reading import read_runs
 from experiments.run_folder import RunFolder
+from experiments.standing import overall_shares
 
 OUT = Path("docs/results")
 LIMIT_BYTES = 4_000_000
 DIGITS = 7
 """As many as single precision has."""
 EPISODES = 2
+FIGURES = "figures"
+"""The folder of the figures that show all recorded runs."""
 COMPARING = ("figure_3", "figure_4", "figure_6a", "universal_learning", "table_1")
 """The paper's figures that show other methods."""
 _COLOURS = 128
@@ -107,17 +111,21 @@ def record(
         folder = out / environment
         changed += [f for f in _stale_files(folder, files) if _remove(f)]
         changed += [folder / name for name, data in files.items() if _write(folder / name, data)]
-    overviews = read_overviews(out)
-    drawn = drawn_comparisons(out)
+    runs_here = read_recorded(out)
+    overviews = [overview(run) for run in runs_here]
+    drawn = drawn_comparisons(runs_here, out)
     remarks = out / "remarks.md"
     page = results_page.page(
         overviews,
         remarks.read_text(encoding="utf-8") if remarks.is_file() else "",
         next((_relative(file, out) for file in drawn if file.stem == "figure_3"), ""),
         _options(out, readme),
+        overall_shares([run for run in runs_here if COMPARED in run]),
     )
     changed += [out / "README.md"] if _write(out / "README.md", page.encode()) else []
     changed += [file for file, data in drawn.items() if _write(file, data)]
+    earlier = sorted((out / FIGURES).glob("*.png"))
+    changed += [file for file in earlier if file not in drawn and _remove(file)]
     if readme is None:
         return changed
     before, after = _split_readme(readme)
@@ -198,16 +206,16 @@ def rounded(value: Any) -> Any:
     return float(f"{value:.{DIGITS}g}") if isinstance(value, float) else value
 
 
-def read_overviews(out: Path) -> list[Overview]:
-    """The rows of all recorded environments, by name.
+def read_recorded(out: Path) -> list[dict[str, Any]]:
+    """The results of all recorded environments, by name.
 
     Raises:
-        UserError: nothing is recorded.
+        UserError: nothing is recorded, or a file is damaged.
     """
     files = sorted(out.rglob("results.json"))
     if not files:
         raise UserError(f"nothing is recorded in {out}; name the folders of finished runs")
-    return [overview(json.loads(file.read_text(encoding="utf-8"))) for file in files]
+    return read_runs([file.parent for file in files])
 
 
 def _options(out: Path, readme: Path | None) -> str:
@@ -217,19 +225,17 @@ def _options(out: Path, readme: Path | None) -> str:
     return said + (" --players" if any(out.rglob(PLAYERS)) else "")
 
 
-def drawn_comparisons(out: Path) -> dict[Path, bytes]:
+def drawn_comparisons(recorded: Sequence[Mapping[str, Any]], out: Path) -> dict[Path, bytes]:
     """The paper's figures that compare methods, by their places; none where none were compared."""
     from experiments.figures import paper
-    from experiments.figures.reading import read_runs
 
-    folders = [file.parent for file in sorted(out.rglob("results.json"))]
-    runs = [run for run in read_runs(folders) if COMPARED in run]
+    runs = [run for run in recorded if COMPARED in run]
     if not runs:
         return {}
     with tempfile.TemporaryDirectory() as temporary:
         paper.draw_paper(runs, Path(temporary), COMPARING)
         return {
-            out / "figures" / file.name: _with_fewer_colours(file)
+            out / FIGURES / file.name: _with_fewer_colours(file)
             for file in sorted(Path(temporary).glob("*.png"))
         }
 

@@ -9,7 +9,7 @@ from rich.table import Table
 
 from experiments.figures import draw_figures
 from experiments.markdown import table as _table
-from experiments.standing import standings
+from experiments.standing import lowest, standings
 from experiments.summary import (
     COMPARISONS,
     HEADLINE,
@@ -48,11 +48,11 @@ _MEANING = {
 _CAPTIONS = {
     "share_of_oracle": "Return divided by the Oracle's, with the standard deviation over held-out "
     "seeds.\nEach dot is one held-out seed, averaged over the styles.",
-    "returns_by_style": "Return with held-out partners by style; error bars are standard "
-    "deviations over seeds.\nEach bar adds one step of the method: what a bar loses to the one "
-    "on its left is that step's cost.",
-    "comparisons_by_style": "The same for the baselines and ablations, beside the Oracle and "
-    "Haland.\nA baseline as tall as Haland means that in this style the sentence was not needed.",
+    "returns_by_style": "Return with held-out partners by style; each dot is one of them.\nEach "
+    "bar adds one step of the method: what a bar loses to the one on its left is that step's cost.",
+    "comparisons_by_style": "The same for universal egos and, below them, for ablations and other "
+    "methods, beside the Oracle and Haland.\nA baseline as tall as Haland means that in this "
+    "style the sentence was not needed.",
     "cross_play": "Best responses to each style with held-out partners of every style: return, and "
     "below it the share of the Oracle of the partner's style.\nA dark diagonal means that knowing "
     "the partner's style pays; an even row means an ego that suits everyone.",
@@ -240,16 +240,25 @@ def _standings(results: Mapping[str, Any]) -> str:
     found = standings(results)
     if "compared" not in results or not found:
         return ""
-    rows = [(HEADLINE, str(found[0].haland), "", "", "")]
+    ours = ratios(results, HEADLINE)
+    headline = f"{mean(ours):.2f} ({lowest(ours):.2f})"
+    rows = [(HEADLINE, str(found[0].haland), headline, "", "", "", "")]
     for one in found:
         steps = "–" if one.steps is None else steps_in_words(one.steps)
         budget = "–" if one.budget is None else f"{one.budget:.0%}"
-        rows.append((one.method, str(one.share), f"**{one.verdict}**", steps, budget))
-    head = ("method", "return / Oracle, IQM (95%)", "Haland is", "steps", "of all best responses'")
+        lead = f"{one.lead.value:+.2f} [{one.lead.low:+.2f}, {one.lead.high:+.2f}]"
+        means = f"{one.mean:.2f} ({one.lowest:.2f})"
+        verdict = f"**{one.verdict}**"
+        rows.append((one.method, str(one.share), means, lead, verdict, steps, budget))
+    head = (
+        *("method", "return / Oracle, IQM (95%)", "mean (lowest style)", "Haland's lead (95%)"),
+        *("Haland is", "steps", "of all best responses'"),
+    )
     return (
-        f"## Beside other methods\n\n{_table(head, rows, 'lrlrr')}\n\n"
-        "With the same held-out partners. *Level*: the intervals overlap. *Steps*: environment "
-        "steps of each ego, and as a share of those of all best responses together."
+        f"## Beside other methods\n\n{_table(head, rows, 'lrrrlrr')}\n\n"
+        "With the same held-out partners. *Lead*: the mean of the differences in return / Oracle "
+        "with each partner. *Level*: its interval has 0 in it. *Steps*: environment steps of each "
+        "ego, and as a share of those of all best responses together."
     )
 
 

@@ -64,8 +64,8 @@ def restore(record: Path, out: Path | None = None) -> Path:
         UserError: there are no players, they do not fit this version or the results beside them,
             or `out` exists.
     """
-    from experiments.figures.reading import read_runs
     from experiments.finished_run import configuration_from
+    from experiments.reading import read_runs
 
     arrays, texts = players.read(record / PLAYERS)
     (results,) = read_runs((record,))

@@ -1,12 +1,13 @@
 """The pages that compare recorded environments, as Markdown."""
 
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Mapping, Sequence
 
 import envs
+from experiments.intervals import Estimate
 from experiments.markdown import table
 from experiments.overview import Overview, number, percent
 from experiments.run_all import ALL, default_path
-from experiments.standing import Standing, improvement_in_words, in_order
+from experiments.standing import improvement_in_words, in_order
 from experiments.summary import COMPARISONS, HEADLINE
 from experiments.worth import steps_in_words
 
@@ -93,7 +94,8 @@ _WORTH: tuple[_Column, ...] = (
     (
         "universal ego",
         lambda row: row.amount(row.universal),
-        "one ego trained with the partners of all styles, told nothing.",
+        "one ego without a memory, trained with the partners of all styles and told nothing; that "
+        "which learnt longest.",
     ),
     (
         "universal ego, told",
@@ -117,7 +119,13 @@ _HOW: tuple[_Column, ...] = (
 )
 
 
-def page(overviews: Sequence[Overview], remarks: str, picture: str = "", options: str = "") -> str:
+def page(
+    overviews: Sequence[Overview],
+    remarks: str,
+    picture: str = "",
+    options: str = "",
+    overall: Mapping[str, Estimate] | None = None,
+) -> str:
     """The page of all recorded results.
 
     Args:
@@ -125,13 +133,15 @@ def page(overviews: Sequence[Overview], remarks: str, picture: str = "", options
         remarks: Markdown by hand, included as it is; empty for none.
         picture: link to a figure of all methods; empty for none.
         options: of the command that records these results.
+        overall: by method that was measured in all environments where others were compared, the
+            interquartile mean of return / Oracle over all their partners.
     """
     sections = [
         "<!-- Made by python -m experiments.record; remarks by hand belong in remarks.md. -->",
-        f"# Results\n\n{_verdict(overviews)}",
+        f"# {_title(overviews)}\n\n{_verdict(overviews)}",
         _table(overviews, _MEASURED),
         _meanings(_MEASURED),
-        beside_others(overviews, picture),
+        beside_others(overviews, picture, overall or {}),
         "## What knowing the style is worth\n\nReturns per episode with held-out partners, mean "
         "over styles.\n\n" + _table(overviews, _WORTH),
         _meanings(_WORTH[1:]),
@@ -165,9 +175,8 @@ def short_table(overviews: Sequence[Overview], folder: str) -> str:
         ),
         *(column for column in _MEASURED[1:] if column[0] not in ("upper bound", "gates met")),
     ]
-    presets = sorted({f"`{row.preset}`" for row in overviews})
     return (
-        f"{_verdict(overviews)} Preset {', '.join(presets)}; [what the columns mean, all "
+        f"{_verdict(overviews)} [What the columns mean, all "
         f"environments in detail, and how to make them again]({folder}/README.md).\n\n"
         + _table(overviews, columns)
     )
@@ -192,28 +201,59 @@ def _sights(overviews: Sequence[Overview]) -> str:
     )
 
 
-def beside_others(overviews: Sequence[Overview], picture: str) -> str:
+def beside_others(
+    overviews: Sequence[Overview], picture: str, overall: Mapping[str, Estimate]
+) -> str:
     """Haland and all other methods by environment; empty where nothing was compared."""
-    found = [row for row in overviews if set(row.shares) - {HEADLINE, *COMPARISONS}]
+    found = [row for row in overviews if _is_compared(row)]
     if not found:
         return ""
     methods = in_order(name for row in found for name in row.shares)
-    rows = [
-        (method, *(str(row.shares[method]) if method in row.shares else "–" for row in found))
-        for method in methods
-    ]
-    head = ("method", *(row.environment for row in found))
-    said = [f"- **{row.environment}**: {_beside(row.best_ego)}" for row in found if row.best_ego]
+
+    def in_each(method: str, cell: Callable[[Overview, str], str]) -> list[str]:
+        return [cell(row, method) if method in row.shares else "–" for row in found]
+
+    def in_all(method: str) -> str:
+        means = [row.means[method][0] for row in found if method in row.means]
+        return f"{sum(means) / len(means):.2f}" if len(means) == len(found) else "–"
+
+    shares = [(name, *in_each(name, _share), str(overall.get(name, "–"))) for name in methods]
+    means = [(name, *in_each(name, _mean_with_lowest), in_all(name)) for name in methods]
+    head = ("method", *(row.environment for row in found), "all")
+    alignment = "l" + "r" * (len(found) + 1)
+    said = [f"- **{row.environment}**: {_beside(row)}" for row in found if row.best_ego]
     parts = (
         "## Beside other methods\n\nReturn / Oracle with held-out partners: interquartile mean "
-        "over styles and held-out seeds, with its stratified bootstrap interval (95%).",
+        "over styles and held-out seeds, with its stratified bootstrap interval (95%), which says "
+        "what other partners of the same styles would give. *All*: over all environments' partners "
+        "alike. –: not measured.",
         f"![return / Oracle of all methods]({picture})" if picture else "",
-        table(head, rows, "l" + "r" * len(found)),
+        table(head, shares, alignment),
+        "The interquartile mean leaves out the quarter of the partners with which a method earns "
+        "most and the quarter with which it earns least: two styles that fail do not show in it. "
+        "So here is the plain mean, in brackets the lowest style, and over all environments the "
+        "mean of their means:",
+        table(head, means, alignment),
+        "Haland beside the best universal ego by that mean; *ahead*, *level* and *behind* go by "
+        "the differences with the same partners:",
         "\n".join(said),
         improvement_in_words(row.gain for row in found),
         _budgets(found),
     )
     return "\n\n".join(filter(None, parts))
+
+
+def _is_compared(row: Overview) -> bool:
+    """Whether other methods were measured than those that every run measures."""
+    return bool(set(row.shares) - {HEADLINE, *COMPARISONS})
+
+
+def _share(row: Overview, method: str) -> str:
+    return str(row.shares[method])
+
+
+def _mean_with_lowest(row: Overview, method: str) -> str:
+    return _with_lowest(*row.means[method])
 
 
 def _budgets(found: Sequence[Overview]) -> str:
@@ -231,35 +271,44 @@ def _budgets(found: Sequence[Overview]) -> str:
     rows = [(method, *(shown(row, method) for row in found)) for method in methods]
     return (
         "Environment steps that one ego took to learn, and as a share of those of all best "
-        "responses together (their pairs and their refits):\n\n"
+        "responses together (pairs, refits, and universal egos where these were a start):\n\n"
         + table(("method", *(row.environment for row in found)), rows, "l" + "r" * len(found))
     )
 
 
-def _beside(best: Standing) -> str:
+def _beside(row: Overview) -> str:
     """Haland beside the best universal ego, in a sentence."""
+    best = row.best_ego
+    assert best is not None
     where = {"ahead": "ahead of", "behind": "behind", "level": "level with"}[best.verdict]
-    overlap = ", and the intervals overlap" if best.verdict == "level" else ""
     budget = "" if best.budget is None else f", {best.budget:.0%} of those of all best responses"
     steps = "" if best.steps is None else f" ({steps_in_words(best.steps)} steps{budget})"
+    lead = best.lead
     return (
-        f"Haland ({best.haland}) is {where} the best universal ego, {best.method}{steps}: "
-        f"{best.share}{overlap}."
+        f"Haland is {where} {best.method}{steps}: {row.means[HEADLINE][0]:.2f} and {best.mean:.2f} "
+        f"of the Oracle in the mean, {lead.value:+.2f} [{lead.low:+.2f}, {lead.high:+.2f}]. The "
+        f"intervals of the interquartile means {'are apart' if best.apart else 'overlap'}."
     )
+
+
+def _title(overviews: Sequence[Overview]) -> str:
+    return "Results beside other methods" if any(map(_is_compared, overviews)) else "Results"
 
 
 def _verdict(overviews: Sequence[Overview]) -> str:
     """What was found, in a sentence or two, good or bad."""
+    presets = ", ".join(sorted({f"`{row.preset}`" for row in overviews}))
     shares = [row.share for row in overviews if row.share is not None]
     if not shares:
-        return "Haland was not measured from test sentences."
+        return f"Preset {presets}: Haland was not measured from test sentences."
     reached = sum(share >= AIM for share in shares)
     earned = f"{min(shares):.1%}"
     if len(shares) > 1:
         earned += f" to {max(shares):.1%}"
     return (
-        f"From sentences never seen, with partners never met, Haland earns {earned} of the Oracle; "
-        f"it reaches the aim of {AIM:.0%} in {reached} of {len(shares)} environments."
+        f"Preset {presets}: from sentences never seen, with partners never met, Haland earns "
+        f"{earned} of the Oracle; it reaches the aim of {AIM:.0%} in {reached} of {len(shares)} "
+        "environments."
     )
 
 

@@ -145,8 +145,9 @@ def spread(values: np.ndarray) -> float:
     return float(np.std(values, ddof=1)) if values.size > 1 else 0.0
 
 
-def mean(values: np.ndarray) -> float:
+def mean(values: np.ndarray | Sequence[float]) -> float:
     """The mean over the numbers that are there; NaN where there is none."""
+    values = np.asarray(values)
     values = values[np.isfinite(values)]
     return float(np.mean(values)) if values.size else float("nan")
 

@@ -5,11 +5,10 @@ from typing import Any
 
 import numpy as np
 
+from experiments.standing import without_memory
 from experiments.summary import (
     BEST_RESPONSE,
     HEADLINE,
-    UNIVERSAL,
-    UNIVERSAL_WITH_LABEL,
     MethodSummary,
     return_digits,
     summarise,
@@ -41,7 +40,7 @@ def _between_styles(results: Mapping[str, Any]) -> list[str]:
     own = float(np.mean(np.diag(values)))
     others = float(np.mean(values[~np.eye(len(values), dtype=bool)]))
     digits = return_digits([own])
-    kept = f", {others / own:.0%} of that" if own > 0 else ""
+    kept = f", {others / own:.0%} of that" if own > 0 and others > 0 else ""
     return [
         f"Best responses earn {own:.{digits}f} with held-out partners of their own style and "
         f"{others:.{digits}f} with those of other styles{kept}."
@@ -49,10 +48,10 @@ def _between_styles(results: Mapping[str, Any]) -> list[str]:
 
 
 def _for_one_ego(results: Mapping[str, Any], rows: Mapping[str, MethodSummary]) -> list[str]:
-    if UNIVERSAL not in rows or UNIVERSAL_WITH_LABEL not in rows:
+    longest = without_memory(results)
+    if longest is None:
         return []
-    plain, told = rows[UNIVERSAL], rows[UNIVERSAL_WITH_LABEL]
-    steps = results["universal"]["steps"]
+    plain, told, steps = rows[longest[0]], rows[longest[1]], longest[2]
     digits = return_digits(row.mean for row in rows.values())
     said = [
         f"One feed-forward ego that learnt with the partners of all styles for "
@@ -76,8 +75,8 @@ def _for_one_ego(results: Mapping[str, Any], rows: Mapping[str, MethodSummary]) 
         lead = rows[ahead].ratio - best.ratio
         place = "ahead of" if lead > 0 else "behind"
         said.append(
-            f"{ahead} ({rows[ahead].ratio:.0%}) is {abs(lead):.0%} of the Oracle {place} the "
-            "better of the two."
+            f"{ahead} ({rows[ahead].ratio:.0%}) is {place} the better of the two by "
+            f"{abs(lead):.0%} of the Oracle."
         )
     return said
 

@@ -2,10 +2,11 @@
 
 1. Each training ego is refitted against *all* frozen partners of its style that are not held
    out, and against those of other styles seen in a mirror (`best_response_refits`): an ego that
-   knew one partner only keeps that partner's private conventions. The universal ego that is told
-   the style (`haland_jax.universal`) is refitted too: it brings what it learnt with other styles.
-   Of the two starts each style keeps the one with the best ego, and of that start those that are
-   as good (`best_egos`). These egos are the archive.
+   knew one partner only keeps that partner's private conventions. The universal ego that earns
+   most with the style (`haland_jax.universal`) is refitted too: it brings what it learnt with
+   others.
+   Each style keeps the universal start, unless its own egos are clearly better, and of that start
+   the egos that are as good (`best_egos`). These egos are the archive.
 2. The Oracle of a held-out partner is the best of a few egos of its style refitted to that very
    partner (`oracle_refits`), chosen on other games than those it is scored on.
 """
@@ -111,11 +112,12 @@ def best_response_refits(
 
 
 def best_egos(egos: Player, returns: np.ndarray) -> tuple[Player, np.ndarray]:
-    """Keeps, for each style, the start that brought the best ego, and of it what is as good.
+    """Keeps one start for each style, and of it the egos that are as good as its best.
 
-    All egos of a style have the same start, so that they stay alike. One that learnt something
-    lesser and earns clearly less than the style's best (`AS_GOOD`) is no best response; a copy
-    of the best takes its place.
+    Of starts whose best egos are as good (`AS_GOOD`) the last one, which has met most partners:
+    returns with partners that it has learnt with say little of those that it will meet. All egos of
+    a style have the same start, so that they stay alike. One that learnt something lesser and earns
+    clearly less than the best is no best response; a copy of the best takes its place.
 
     Args:
         egos: refitted egos, leading axes [style, start * seed].
@@ -125,15 +127,20 @@ def best_egos(egos: Player, returns: np.ndarray) -> tuple[Player, np.ndarray]:
         The kept egos, leading axes [style, seed], and their places among the given ones,
         int [style, seed].
     """
-    styles, _, seeds = returns.shape
-    best = returns.reshape(styles, -1).argmax(axis=1)
-    highest = returns.reshape(styles, -1).max(axis=1)
-    start = best // seeds
+    styles, starts, seeds = returns.shape
+    by_start = returns.max(axis=2)
+    start = starts - 1 - _as_good(by_start)[:, ::-1].argmax(axis=1)
     of_start = returns[np.arange(styles), start]
-    good = of_start >= (highest - (1 - AS_GOOD) * np.abs(highest))[:, None]
+    best = start * seeds + of_start.argmax(axis=1)
     own_place = start[:, None] * seeds + np.arange(seeds)
-    kept = np.where(good, own_place, best[:, None])
+    kept = np.where(_as_good(of_start), own_place, best[:, None])
     return take_seeds(egos, kept), kept
+
+
+def _as_good(returns: np.ndarray) -> np.ndarray:
+    """Which of each row's returns count as good as its highest, bool [style, n]."""
+    highest = returns.max(axis=1, keepdims=True)
+    return returns >= highest - (1 - AS_GOOD) * np.abs(highest)
 
 
 def oracle_refits(

@@ -6,9 +6,9 @@ paper, and an array's entry i - 1 belongs to step i.
 """
 
 from collections.abc import Callable
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, fields
 from functools import partial
-from typing import Any
+from typing import Any, ClassVar
 
 import flax.linen as nn
 import jax
@@ -75,6 +75,9 @@ class DiffusionConfig:
         )
     )
 
+    predicts_clean: ClassVar[bool] = False
+    """Whether the UNet gives the clean latent (`CleanDiffusionConfig`), and not a velocity."""
+
     def __post_init__(self):
         expected = {
             "bins": (self.bins >= 2, ">= 2"),
@@ -102,6 +105,21 @@ class DiffusionConfig:
     def latent_size(self) -> int:
         """D, numbers in one latent."""
         return int(np.prod(self.grid))
+
+
+class CleanDiffusionConfig(DiffusionConfig):
+    """A diffusion whose UNet gives the clean latent itself.
+
+    For latents of more numbers than can pass through the UNet at once. Noise, and so a velocity,
+    fills all of them; the clean latents of a few policies lie in few directions.
+    """
+
+    predicts_clean: ClassVar[bool] = True
+
+    @classmethod
+    def like(cls, config: DiffusionConfig) -> "CleanDiffusionConfig":
+        """A configuration with the same settings."""
+        return cls(**{one.name: getattr(config, one.name) for one in fields(config)})
 
 
 class LatentArchive(PyTreeNode):
@@ -162,7 +180,8 @@ class NoisePredictor(nn.Module):
 
     ε_θ = √ᾱ_i UNet + √(1 - ᾱ_i) z_i, the velocity form of Salimans & Ho (2022). If the UNet were to
     give ε itself, its error would enter the clean latent divided by √ᾱ_i, by 158 times at i = N,
-    and a short fit would not sample anything usable.
+    and a short fit would not sample anything usable. With `CleanDiffusionConfig` the UNet gives the
+    clean latent, and ε_θ = (z_i - √ᾱ_i UNet) / √(1 - ᾱ_i).
     """
 
     config: DiffusionConfig
@@ -191,6 +210,8 @@ class NoisePredictor(nn.Module):
         scaled = step * (PAPER_STEPS / self.config.noise_steps)
         output = self.unet(noisy.reshape(self.config.grid), scaled, tokens).reshape(-1)
         alpha_bar = noise_schedule(self.config.noise_steps).alpha_bar[step - 1]
+        if self.config.predicts_clean:
+            return (noisy - jnp.sqrt(alpha_bar) * output) / jnp.sqrt(1 - alpha_bar)
         return jnp.sqrt(alpha_bar) * output + jnp.sqrt(1 - alpha_bar) * noisy
 
 
@@ -239,6 +260,8 @@ def make_diffusion_loss(config: DiffusionConfig) -> LossFn:
     """Eq. 5 as a loss_fn for `fit`: squared error of the noise, mean over B and over D.
 
     The noise step is uniform over 1 .. N. The paper sums; the mean differs by a constant factor.
+    With `CleanDiffusionConfig` a noise step weighs (1 - ᾱ_i) / ᾱ_i, which makes that the squared
+    error of the clean latent.
     """
     network, schedule = NoisePredictor(config), noise_schedule(config.noise_steps)
 
@@ -253,7 +276,11 @@ def make_diffusion_loss(config: DiffusionConfig) -> LossFn:
         noisy = jax.vmap(add_noise, (None, 0, 0, 0))(schedule, z, step, noise)
         predicted = jax.vmap(network.apply, (None, 0, 0, 0, 0))(params, noisy, step, v_hat, dropped)
         error = jnp.mean(jnp.square(jnp.asarray(predicted) - noise), axis=-1)  # [B]
-        weight = jnp.minimum(1 / schedule.alpha_bar[step - 1], config.largest_weight)
+        alpha_bar = schedule.alpha_bar[step - 1]
+        if config.predicts_clean:
+            weight = (1 - alpha_bar) / alpha_bar
+        else:
+            weight = jnp.minimum(1 / alpha_bar, config.largest_weight)
         return jnp.mean(weight * error), {"noise_error": jnp.mean(error)}
 
     return loss_fn

@@ -84,7 +84,8 @@ class PartnersConfig:
         oracle_candidates: egos that are refitted for each held-out partner.
         mirror: also learn with the partners of other styles as they look in the environment's
             mirrors, where it has any.
-        universal_start: also refit the universal ego, and keep the better start of each style.
+        universal_start: also refit the universal ego that earns most with a style, and keep that
+            start of each style, unless its own is clearly better.
         evaluation_games: games of each pair in an evaluation.
     """
 
@@ -364,35 +365,3 @@ def make_population(
         held_out_index=jnp.asarray(held_out),
         known_index=jnp.asarray(known, jnp.int32),
     )
-
-
-def visited_observations(
-    env: Environment,
-    key: jax.Array,
-    ego: Policy,
-    partners: Policy,
-    style: Any,
-    *,
-    num_kept: int,
-) -> jax.Array:
-    """Returns observations of the ego in games with partners, drawn at random, [num_kept, O].
-
-    Half of the games go on from a random moment, so that the observations cover more than what
-    these partners lead to. Observations after a game's end are never drawn.
-
-    Args:
-        env: the environment.
-        key: consumed.
-        ego: parameters of the ego's actor.
-        partners: actors of the partners, leading axis [game]; there is one game with each.
-        style: the partners' style.
-        num_kept: observations to draw, with replacement.
-    """
-    game_key, draw_key = jax.random.split(key)
-    record = partial(rollout.record, env, random_share=0.5)
-    keys = jax.random.split(game_key, jax.tree.leaves(partners)[0].shape[0])
-    games = jax.vmap(lambda k, partner: record(k, ego, partner, style))(keys, partners)
-    observations = games.observations.ego.reshape(-1, games.observations.ego.shape[-1])
-    alive = games.alive.reshape(-1).astype(jnp.float32)
-    drawn = jax.random.choice(draw_key, alive.shape[0], (num_kept,), p=alive / jnp.sum(alive))
-    return observations[drawn]

@@ -164,15 +164,22 @@ class PolicyVAE(nn.Module):
 
     def encode(self, policy: Policy) -> Posterior:
         """Mean and log-variance of z, [D] each."""
-        if self.config.normalised:
-            policy = networks.unfold_normalisation(policy, *self._statistics)
-        return self.encoder(policy)
+        return self.encoder(self.unfold(policy))
 
     def decode(self, latent: Array) -> Policy:
         """The policy of z [D], with the pytree structure of `architecture`."""
-        policy = self.decoder(latent)
+        return self.fold(self.decoder(latent))
+
+    def unfold(self, policy: Policy) -> Policy:
+        """A policy as encoder and decoder see it: reading normalised observations, if they do."""
         if self.config.normalised:
-            policy = networks.fold_normalisation(policy, *self._statistics)
+            return networks.unfold_normalisation(policy, *self._statistics)
+        return policy
+
+    def fold(self, policy: Policy) -> Policy:
+        """The inverse of `unfold`: a policy that reads raw observations."""
+        if self.config.normalised:
+            return networks.fold_normalisation(policy, *self._statistics)
         return policy
 
     @property

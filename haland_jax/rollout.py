@@ -3,6 +3,7 @@
 The partner is a policy. The ego is a policy too, or an `Agent`, which may remember.
 """
 
+from functools import partial
 from typing import Any
 
 import jax
@@ -208,6 +209,43 @@ def record(
     shown = jnp.zeros(env.num_actions.partner)
     carry = (state, timestep.observation, agent.begin(1), shown, jnp.ones((), bool))
     return jax.lax.scan(one_step, carry, jax.random.split(play_key, env.max_steps))[1]
+
+
+def visited_observations(
+    env: Environment,
+    key: jax.Array,
+    ego: Policy,
+    partners: Policy,
+    style: Any,
+    *,
+    num_kept: int,
+    games_each: int = 1,
+) -> jax.Array:
+    """Returns observations of the ego in games with partners, drawn at random, [num_kept, O].
+
+    Half of the games go on from a random moment, so that the observations cover more than what
+    these partners lead to. Observations after a game's end are never drawn.
+
+    Args:
+        env: the environment.
+        key: consumed.
+        ego: parameters of the ego's actor.
+        partners: actors of the partners, leading axis [partner].
+        style: the partners' style.
+        num_kept: observations to draw, with replacement.
+        games_each: games with each partner. Where they have few steps, many are needed, or the same
+            observations are drawn again and again.
+    """
+    game_key, draw_key = jax.random.split(key)
+    played = partial(record, env, random_share=0.5)
+    number = jax.tree.leaves(partners)[0].shape[0]
+    keys = jax.random.split(game_key, (games_each, number))
+    with_each = jax.vmap(lambda k, partner: played(k, ego, partner, style))
+    games = jax.vmap(with_each, in_axes=(0, None))(keys, partners)
+    observations = games.observations.ego.reshape(-1, games.observations.ego.shape[-1])
+    alive = games.alive.reshape(-1).astype(jnp.float32)
+    drawn = jax.random.choice(draw_key, alive.shape[0], (num_kept,), p=alive / jnp.sum(alive))
+    return observations[drawn]
 
 
 def draw_actions(key: jax.Array, distributions: Pair, *, greedy: bool = False) -> Pair:

@@ -28,7 +28,7 @@ VARIANTS = (TOLD_NOTHING, TOLD_THE_STYLE)
 
 
 def universal_config(total_steps: int, num_envs: int = 192, num_minibatches: int = 8) -> PPOConfig:
-    """Returns settings for an ego that learns from nothing with frozen partners.
+    """Returns settings for an ego that learns from scratch with frozen partners.
 
     The ego is never held to a role: one that is told nothing could not know which.
 

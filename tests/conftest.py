@@ -36,6 +36,8 @@ def pytest_configure(config):
     folder = str(config.cache.mkdir("compiled"))
     os.environ.setdefault("JAX_COMPILATION_CACHE_DIR", folder)
     jax.config.update("jax_compilation_cache_dir", os.environ["JAX_COMPILATION_CACHE_DIR"])
+    # The commands that tests start compile lightly too (`compiled`).
+    os.environ.setdefault("JAX_DISABLE_MOST_OPTIMIZATIONS", "1")
     # Small programs too: both workers and the commands they start compile much the same ones.
     jax.config.update("jax_persistent_cache_min_compile_time_secs", 0.0)
 
@@ -58,27 +60,29 @@ def pytest_collection_modifyitems(items):
 
 
 @contextlib.contextmanager
-def compiled_lightly():
-    """Programs compile in half the time and run slower; for what runs for a moment only."""
-    jax.config.update("jax_disable_most_optimizations", True)
+def compiled(*, lightly: bool):
+    """Programs compile lightly in half the time and run slower; for what runs for a moment only."""
+    before = jax.config.read("jax_disable_most_optimizations")
+    jax.config.update("jax_disable_most_optimizations", lightly)
     try:
         yield
     finally:
-        jax.config.update("jax_disable_most_optimizations", False)
+        jax.config.update("jax_disable_most_optimizations", before)
 
 
 @pytest.fixture(autouse=True, scope="module")
 def compilation(request):
-    """Compiles the programs of modules that are marked so in half the time."""
-    light = request.node.get_closest_marker("light_compilation") is not None
-    with compiled_lightly() if light else contextlib.nullcontext():
+    """Compiles programs lightly, but those of modules whose programs run for long."""
+    long = request.node.get_closest_marker("full_compilation") is not None
+    with compiled(lightly=not long):
         yield
 
 
 @pytest.fixture(scope="session")
 def smoke_run(tmp_path_factory, worker_id):
     """The folder of an uninterrupted smoke run; made once, not to be written to."""
-    from experiments import configs, training
+    from experiments import configs, report, training
+    from experiments.figures import draw_figures
     from experiments.pipeline import run_pipeline
 
     folder = tmp_path_factory.getbasetemp()
@@ -87,11 +91,27 @@ def smoke_run(tmp_path_factory, worker_id):
     path = folder / "smoke"
     with filelock.FileLock(folder / "smoke.lock"):
         if not (path / "report" / "metrics.json").exists():
-            with compiled_lightly(), pytest.MonkeyPatch.context() as patched:
+            with compiled(lightly=True), pytest.MonkeyPatch.context() as patched:
                 # Pieces as in the interrupted run of test_pipeline.py, which has its programs then.
                 patched.setattr(training, "UPDATES_PER_PIECE", 4)
+                # With its figures, also where the module that comes first has `no_drawing`.
+                patched.setattr(report, "draw_figures", draw_figures)
                 run_pipeline(configs.smoke(configs.DEFAULT_ENVIRONMENT, seed=0), path)
     return path
+
+
+@pytest.fixture(scope="module")
+def no_drawing():
+    """Reports name their figures and do not draw them; that has tests of its own."""
+    from experiments import report
+
+    def name_only(results, folder):
+        folder.mkdir(exist_ok=True)
+        return [folder / "returns_by_style.png", folder / "cross_play.png"]
+
+    with pytest.MonkeyPatch.context() as patched:
+        patched.setattr(report, "draw_figures", name_only)
+        yield
 
 
 @pytest.fixture(scope="session")

@@ -4,9 +4,13 @@ import sys
 
 import pytest
 
+from experiments import devices
+
 
 def refused(capsys, monkeypatch, command, *arguments) -> str:
     """Runs a command that must end with one line on standard error; returns that line."""
+    # The tests' process has its devices already, also where they are not as many as its cores.
+    monkeypatch.setattr(devices, "prepare", lambda **_: None)
     monkeypatch.setattr(sys, "argv", [command.__name__, *map(str, arguments)])
     with pytest.raises(SystemExit) as stopped:
         command.main()

@@ -10,8 +10,6 @@ from experiments import alone, training
 from experiments.alone import Plan
 from haland_jax.ppo_loss import PPOConfig
 
-pytestmark = pytest.mark.light_compilation
-
 PLAN = Plan(
     seeds=1,
     games=16,

@@ -14,8 +14,6 @@ import envs
 from envs.assistive import control, model, physics, scene, viewer
 from envs.base import Pair
 
-pytestmark = pytest.mark.light_compilation
-
 STEPS = 40
 
 

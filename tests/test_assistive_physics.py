@@ -9,6 +9,8 @@ from jax.sharding import Mesh, PartitionSpec
 
 from envs.assistive import control, model, physics
 
+pytestmark = pytest.mark.full_compilation
+
 STEPS = 100
 MJX = {"xla_cpu_use_fusion_emitters": False}
 

@@ -8,6 +8,8 @@ import pytest
 from envs.assistive import events, reward, styles, tasks
 from envs.assistive.physics import Physics, Poses
 
+pytestmark = pytest.mark.full_compilation
+
 ALL = styles.all_styles()
 
 

@@ -9,7 +9,6 @@ from haland_jax import networks
 from haland_jax.behaviour_cloning import CloningConfig, Demonstrations, clone
 from haland_jax.fit import FitConfig
 
-pytestmark = pytest.mark.light_compilation
 CONFIG = CloningConfig(FitConfig(learning_rate=5e-3, steps=400, warmup_steps=10), batch_size=64)
 
 

@@ -11,8 +11,6 @@ from experiments import benchmark, benchmark_ppo, contenders
 from experiments.configs import PRESETS
 from haland_jax.ppo import PPOConfig
 
-pytestmark = pytest.mark.light_compilation
-
 
 def test_our_games_restart_after_400_steps():
     contender = contenders.our_games("cramped_room", "features")

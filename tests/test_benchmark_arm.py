@@ -8,6 +8,8 @@ from rich.console import Console
 from experiments import benchmark_arm
 from experiments.benchmark_arm import OURS, PEER, PHYSICS
 
+pytestmark = pytest.mark.full_compilation
+
 
 @pytest.fixture
 def found(monkeypatch):

@@ -11,8 +11,6 @@ from experiments import benchmark_brax
 from haland_jax.learner import make_networks
 from haland_jax.ppo_loss import PPOConfig
 
-pytestmark = pytest.mark.light_compilation
-
 CONFIG = PPOConfig(
     total_steps=PPOConfig().rollout_steps * 8 * 80,
     num_envs=8,

@@ -9,8 +9,6 @@ from envs.lbf import dynamics
 from experiments import benchmark, benchmark_lbf, contenders, contenders_lbf
 from experiments.contenders_lbf import RULES
 
-pytestmark = pytest.mark.light_compilation
-
 
 def advanced(contender, carried, keys):
     """Plays on; jitted."""

@@ -21,6 +21,8 @@ from haland_jax.bert_weights import (
     tokenize,
 )
 
+pytestmark = pytest.mark.full_compilation
+
 GOLDEN = Path(os.environ.get("GOLDEN_DIR", Path(__file__).parent / "golden")) / "bert"
 TOLERANCE = 1e-4
 WIDTH, LAYERS, INTERMEDIATE, VOCABULARY = 8, 2, 12, 20

@@ -13,8 +13,6 @@ from haland_jax.diffusion import LatentArchive, latent_statistics
 from haland_jax.fit import FitConfig, init_fit, make_fit_chunk
 from haland_jax.unet import UNetConfig
 
-pytestmark = pytest.mark.light_compilation
-
 SMALL = CGANConfig(
     hidden=(64, 64),
     batch_size=32,

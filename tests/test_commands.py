@@ -19,8 +19,6 @@ from experiments.stages import STAGE_NAMES
 from haland_jax import partners
 from haland_jax.fit import NonFiniteLoss
 
-pytestmark = pytest.mark.light_compilation
-
 ROOT = Path(__file__).parent.parent
 
 

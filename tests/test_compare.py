@@ -21,11 +21,16 @@ from haland_jax import checkpoint
 ROOT = Path(__file__).parent.parent
 EXAMPLE = ROOT / "docs" / "examples" / "retrieval.py"
 STEPS = 8000
-# All but two, which others cover: FCP's pool learns as self-play does, tests/test_cgan.py has the
-# UNet as generator.
-TRIED = tuple(name for name in compare.NAMES if name not in ("self-play", "cgan-unet"))
+# All but three, which others cover: FCP's pool learns as self-play does, tests/test_cgan.py has the
+# UNet as generator, tests/test_diffusion.py the clean prediction.
+TRIED = tuple(
+    name for name in compare.NAMES if name not in ("self-play", "cgan-unet", "no-vae-clean")
+)
 
-pytestmark = [pytest.mark.timeout(1500), pytest.mark.light_compilation]
+pytestmark = [
+    pytest.mark.timeout(1500),
+    pytest.mark.usefixtures("no_drawing"),
+]
 
 
 @pytest.fixture(scope="module", autouse=True)
@@ -51,7 +56,7 @@ def run_command(monkeypatch, command, *arguments) -> None:
 
 
 @pytest.fixture(scope="module")
-def compared_run(smoke_run, tmp_path_factory):
+def compared_run(smoke_run, tmp_path_factory, no_drawing):
     """A copy of the smoke run with all methods."""
     path = Path(shutil.copytree(smoke_run, tmp_path_factory.mktemp("compared") / "run"))
     compare.measure(path, TRIED, STEPS, 2, EXAMPLE)

@@ -19,8 +19,6 @@ from haland_jax.partners import PartnersConfig
 from haland_jax.ppo_loss import PPOConfig
 from haland_jax.universal import TOLD_THE_STYLE, UniversalConfig
 
-pytestmark = pytest.mark.light_compilation
-
 TRAINING = PPOConfig(
     total_steps=12_000,
     num_envs=12,

@@ -9,6 +9,7 @@ import pytest
 from flax import serialization
 
 from haland_jax.diffusion import (
+    CleanDiffusionConfig,
     Conditioner,
     DiffusionConfig,
     DiffusionParams,
@@ -29,8 +30,6 @@ from haland_jax.diffusion import (
 )
 from haland_jax.fit import FitConfig, init_fit, make_fit_chunk
 from haland_jax.unet import UNetConfig
-
-pytestmark = pytest.mark.light_compilation
 
 TINY = DiffusionConfig(
     unet=UNetConfig(channels=16, inner_channels=32, groups=4, heads=2, step_features=16),
@@ -314,3 +313,42 @@ def test_any_vector_can_be_the_condition():
     z = sample(jax.random.key(1), DiffusionParams(params, latent_statistics(archive)),
                archive.v_hat[0], config)  # fmt: skip
     assert z.shape == (64,)
+
+
+def test_a_clean_diffusion_of_more_numbers_than_can_pass_through_the_unet():
+    """640 numbers through 16 cells of 16 channels: noise cannot pass, four policies can."""
+    fit = dataclasses.replace(TINY.fit, steps=150)
+    tiny = dataclasses.replace(TINY, grid=(4, 4, 40), batch_size=16, fit=fit)
+    config = CleanDiffusionConfig.like(tiny)
+    clusters = two_clusters()
+    mixing = jax.random.normal(jax.random.key(0), (64, config.latent_size)) / 8
+    archive = clusters.replace(
+        z_mean=clusters.z_mean @ mixing,
+        z_log_variance=jnp.full((4, config.latent_size), -14.0),
+    )
+    statistics = latent_statistics(archive)
+    chunk = make_fit_chunk(
+        make_diffusion_loss(config),
+        make_sample_fn(config, statistics),
+        config.fit,
+        config.fit.steps,
+    )
+    network = init_network(jax.random.key(1), config, 3)
+    state, _ = chunk(init_fit(jax.random.key(2), network, config.fit), archive)
+    params = DiffusionParams(state.ema, statistics)
+    draw = jax.jit(jax.vmap(lambda key: sample(key, params, archive.v_hat[0], config)))
+    drawn = draw(jax.random.split(jax.random.key(3), 4))
+    stored = statistics.standardise(archive.z_mean)
+    apart = jnp.square(statistics.standardise(drawn)[:, None] - stored)
+    distance = np.asarray(jnp.sqrt(jnp.mean(apart, axis=-1)))
+    assert (distance.argmin(axis=1) < 2).all(), "of the style that was asked for"
+    assert distance.min(axis=1).max() < 0.3
+
+
+def test_the_loss_of_a_clean_diffusion_is_the_error_of_the_clean_latent():
+    """A fresh UNet gives zero, which is off by the latent itself, at every noise step."""
+    config = CleanDiffusionConfig.like(TINY)
+    params = init_network(jax.random.key(0), config, 3)
+    batch = (jnp.full((32, 64), 3.0), jnp.zeros((32, 3)))
+    loss, _ = jax.jit(make_diffusion_loss(config))(params, jax.random.key(1), batch)
+    assert float(loss) == pytest.approx(9.0, rel=1e-2)

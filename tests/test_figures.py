@@ -100,7 +100,7 @@ def test_a_run_that_learnt_nothing_is_still_drawn(tmp_path):
 def test_the_bars_are_as_tall_as_the_returns():
     results = made_up_results()
     axes = figures.returns_by_style(results).axes[0]
-    bars = [[patch.get_height() for patch in group.patches] for group in axes.containers[1::2]]
+    bars = [[patch.get_height() for patch in group.patches] for group in axes.containers]
     labels = [text.get_text() for text in axes.figure.legends[0].get_texts()]
     assert labels == ["Oracle", *SHARES]
     for method, heights in zip(labels, bars, strict=True):
@@ -138,6 +138,19 @@ def test_the_comparisons_stand_beside_the_oracle_and_haland():
         .get_texts()
     ]
     assert labels == ["Oracle", "Haland, test sentences", *UNIVERSAL_SHARES, "General"]
+
+
+def test_universal_egos_and_other_methods_have_a_panel_each():
+    results = made_up_results(("General",))
+    figure = figures.comparisons_by_style(results)
+    assert figure is not None
+    egos, others = figure.axes
+    assert len(egos.containers) == 2 + len(UNIVERSAL_SHARES)
+    assert len(others.containers) == 2 + 1
+    shown = ("Oracle", summary.HEADLINE, "General")
+    dots = np.concatenate([np.asarray(line.get_ydata()) for line in others.lines[: len(shown)]])
+    expected = [summary.returns(results, name).ravel() for name in shown]
+    np.testing.assert_allclose(dots, np.concatenate(expected))
 
 
 def test_a_heatmap_cell_holds_its_own_event_and_style():

@@ -15,8 +15,6 @@ from haland_jax.hypernetwork import (
     Sweeps,
 )
 
-pytestmark = pytest.mark.light_compilation
-
 
 def _policy(kind="categorical", observation_dim=20, hidden=(16, 12), action_dim=5):
     actor = networks.MLPActor(action_dim, hidden=hidden, kind=kind)

@@ -12,6 +12,8 @@ import pytest
 from envs.lbf import dynamics, observation
 from envs.lbf.dynamics import Rules, State
 
+pytestmark = pytest.mark.full_compilation
+
 GOLDEN = Path(os.environ.get("GOLDEN_DIR", Path(__file__).parent / "golden")) / "lbf"
 RECORDINGS = sorted(GOLDEN.glob("*.npz"))
 

@@ -10,6 +10,8 @@ import pytest
 
 from envs.overcooked import dynamics, events, layouts, reward
 
+pytestmark = pytest.mark.full_compilation
+
 GOLDEN = Path(os.environ.get("GOLDEN_DIR", Path(__file__).parent / "golden")) / "overcooked"
 RECORDINGS = sorted(GOLDEN.glob("*.npz"))
 

@@ -11,8 +11,6 @@ from envs.overcooked import dynamics
 from envs.overcooked.layouts import CLASSIC, STYLED
 from haland_jax import networks, partners
 
-pytestmark = pytest.mark.light_compilation
-
 # By kitchen: the mirror of a place, and whether onions are tomatoes in it. Worked out by hand.
 MIRRORS = {
     "center_pots": (lambda x, y: (6 - x, y), False),

@@ -100,21 +100,36 @@ def test_the_improvement_by_hand():
         }
         return {"styles": ["s"], "oracle": {"s": [10.0]}, "methods": methods}
 
-    # Beside the best: 10 / 5 - 1 = 1 and 9 / 9 - 1 = 0; beside each: 1, 4, 0, 2.
-    runs = [run(10.0, 5.0, 2.0), run(9.0, 9.0, 3.0), run(1.0)]
+    # Beside the best: 10 / 5 - 1 = 1, 9 / 9 - 1 = 0 and 9 / 5 - 1 = 0.8. Beside each: 1 and 4, 0
+    # and 2, 0.8 alone; environments count alike, however many egos they have.
+    runs = [run(10.0, 5.0, 2.0), run(9.0, 9.0, 3.0), run(9.0, 5.0), run(1.0)]
     found = standing.improvement(map(standing.gain, runs))
     assert found is not None
-    assert found.best == pytest.approx(0.5)
-    assert found.each == pytest.approx((1.75,))
+    assert found.best == pytest.approx(0.6)
+    assert found.median == pytest.approx(0.8)
+    assert found.each == pytest.approx((2.5 + 1.0 + 0.8) / 3)
     said = standing.improvement_in_words(map(standing.gain, runs))
-    assert "+50.0% beside the best" in said
-    assert "over 2 environments" in said
-    assert "+175.0% beside each" in said
+    assert "+60.0% beside the best" in said
+    assert "(median +80.0%)" in said
+    assert "over 3 environments" in said
+    assert "+143.3% beside each" in said
     # Beside an ego that loses there is no share: it is left out, and nothing is said of it alone.
     losing = standing.gain(run(5.0, 4.0, -1.0))
     assert losing is not None
-    np.testing.assert_allclose([losing.best, *losing.each], [0.25, 0.25, np.nan])
+    np.testing.assert_allclose(losing, [0.25, 0.25])
     assert standing.improvement_in_words([standing.gain(run(5.0, -1.0)), None]) == ""
+
+
+def test_two_processes_draw_what_one_does(tmp_path):
+    names = ("figure_3", "figure_8_to_11")
+    alone = paper.draw_paper(two_runs(), tmp_path / "one", names)
+    together = paper.draw_paper(two_runs(), tmp_path / "two", names, processes=2)
+    assert [len(files) for files in alone.values()] == [1, 2]
+    assert list(together) == list(alone)
+    for name in names:
+        for one, other in zip(alone[name], together[name], strict=True):
+            assert other.name == one.name
+            assert other.read_bytes() == one.read_bytes()
 
 
 def test_folders_that_are_no_runs_are_refused(capsys, monkeypatch, tmp_path):

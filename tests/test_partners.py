@@ -1,6 +1,7 @@
 """Partners: how seeds are chosen and dealt out, and what each kind of training starts from."""
 
 import dataclasses
+from types import SimpleNamespace
 
 import jax
 import jax.numpy as jnp
@@ -8,12 +9,12 @@ import numpy as np
 import pytest
 from toy_game import ToyGame, always
 
+from experiments.configs import CompressionConfig
+from experiments.stages.model import Visits
 from haland_jax import best_responses, partners
 from haland_jax.partners import PartnersConfig, Player
 from haland_jax.ppo import PPOConfig
 from haland_jax.seeds import meet_next_partners, select_from_circles, select_seeds, take_seeds
-
-pytestmark = pytest.mark.light_compilation
 
 TINY = PPOConfig(
     total_steps=80, num_envs=4, rollout_steps=5, num_minibatches=2, epochs=1, confined_until=0.0
@@ -202,19 +203,20 @@ def test_the_universal_ego_is_refitted_beside_the_own_egos(game, population):
         np.testing.assert_array_equal(frozen, expected)
 
 
-def test_each_style_keeps_the_start_with_the_best_ego_and_what_is_as_good():
-    egos = Player({"bias": jnp.arange(12.0).reshape(3, 4)}, {"bias": jnp.zeros((3, 4, 3))})
+def test_each_style_keeps_one_start_and_what_is_as_good():
+    egos = Player({"bias": jnp.arange(16.0).reshape(4, 4)}, {"bias": jnp.zeros((4, 4, 3))})
     returns = np.array(
         [
             [[5.0, 6.0], [9.0, 1.0]],  # the second start's first ego; its second one is worse
             [[300.0, 292.0], [290.0, 0.0]],  # both of the first start: 292 is 97.3% of 300
             [[-50.0, -10.0], [-10.3, -9.9]],  # 3% of 9.9 below -9.9 is -10.197
+            [[100.0, 99.0], [95.0, 97.5]],  # as good, so the second start; 95 is 97.4% of 97.5
         ]
     )
     kept, places = best_responses.best_egos(egos, returns)
-    np.testing.assert_array_equal(places, [[2, 2], [0, 1], [3, 3]])
-    np.testing.assert_array_equal(kept.actor["bias"], [[2, 2], [4, 5], [11, 11]])
-    assert kept.critic["bias"].shape == (3, 2, 3)
+    np.testing.assert_array_equal(places, [[2, 2], [0, 1], [3, 3], [2, 3]])
+    np.testing.assert_array_equal(kept.actor["bias"], [[2, 2], [4, 5], [11, 11], [14, 15]])
+    assert kept.critic["bias"].shape == (4, 2, 3)
 
 
 def test_refits_change_the_egos_and_leave_the_partners_alone(game, population):
@@ -263,21 +265,15 @@ def test_evaluation_plays_every_pair_with_its_style(game):
     np.testing.assert_array_equal(played.returns, [[0, 0], [5, 5], [6, 6]])
 
 
-def test_visited_observations_are_of_games_that_are_on(game):
-    visited = jax.jit(
-        lambda key: partners.visited_observations(
-            game,
-            key,
-            always(1, 3, 3),
-            jax.tree.map(lambda leaf: jnp.stack(4 * [leaf]), always(0, 2, 4)),
-            game.style("short"),
-            num_kept=200,
-        )
-    )(jax.random.key(0))
-    assert visited.shape == (200, 3)
-    # The short game is over after three steps: times 0, 1 and 2 of 5 are seen, and all of them.
-    np.testing.assert_allclose(np.unique(np.asarray(visited[:, 1])), [0.0, 0.2, 0.4], atol=1e-6)
-    assert len(np.unique(np.asarray(visited[:, 2]))) == 4, "states of all games are drawn"
+def test_few_of_the_policy_vae_s_states_are_drawn_twice(game, population):
+    wanted = CompressionConfig(own_states=100, other_states=20, decoded_states=20)
+    config = SimpleNamespace(partners=CONFIG, compression=wanted, max_steps=game.max_steps)
+    visits = Visits(SimpleNamespace(env=game, config=config), population)
+    policies = partners.flatten(population.train_egos.actor)
+    states = np.asarray(visits.own_partners(jax.random.key(0), policies, 100))
+    assert states.shape == (4, 100, 3)
+    # 400 steps of full games: 3 in 5 are played in `short`, so 100 of 240 or more are drawn.
+    assert min(len(np.unique(one, axis=0)) for one in states) > 70
 
 
 @pytest.mark.parametrize("name", ["train_seeds", "held_out_seeds", "oracle_candidates"])

@@ -39,8 +39,9 @@ def test_every_participant_counts_once():
     haland = found["haland"]
     assert (haland.rounds, haland.people) == (3, 2)
     assert haland.score.value == pytest.approx((80 + 20) / 2)
-    assert haland.score.low == 20
-    assert haland.score.high == 80
+    # Two people say little: 30 * sqrt(2 / 1) * 12.706 / 1.960 on each side.
+    assert haland.score.low == pytest.approx(50 - 275.05, abs=0.01)
+    assert haland.score.high == pytest.approx(50 + 275.05, abs=0.01)
     assert haland.rating is not None
     assert haland.rating.value == pytest.approx((4 + 2) / 2)
     assert found["oracle"].score == pytest.approx((40, 40, 40))

@@ -28,7 +28,7 @@ from experiments.stages import STAGES
 from experiments.stages.best_responses import STARTS
 from haland_jax.universal import VARIANTS
 
-pytestmark = [pytest.mark.slow, pytest.mark.timeout(1500), pytest.mark.light_compilation]
+pytestmark = [pytest.mark.slow, pytest.mark.timeout(1500)]
 
 METHODS = {
     evaluation.ORACLE,
@@ -88,6 +88,13 @@ def test_results_hold_every_method_style_and_held_out_seed(results):
         assert np.shape(universal["curve_returns"][variant]) == (2, len(universal["curve_steps"]))
     assert {"value", "bar", "met"} <= set(next(iter(results["gates"].values())))
     assert np.isfinite(numbers(results)).all()
+
+
+def test_best_responses_cost_their_pairs_the_universal_egos_and_their_refits(results):
+    # Of 8 styles 2 pairs of 1,280 steps; 2 universal egos of both kinds of 640 steps; 2 refits of
+    # 640 from each start.
+    steps = 8 * 2 * 1280 + 2 * 2 * 640 + 8 * 2 * 2 * 640
+    assert results["universal"]["best_response_steps"] == steps
 
 
 def test_the_run_folder_is_complete(smoke_run, results):

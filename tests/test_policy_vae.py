@@ -3,6 +3,7 @@
 import dataclasses
 from functools import partial
 
+import chex
 import jax
 import jax.numpy as jnp
 import numpy as np
@@ -11,8 +12,6 @@ import pytest
 from haland_jax import fit, networks, policy_vae
 from haland_jax.hypernetwork import HypernetworkConfig, PolicyArchitecture
 from haland_jax.policy_vae import PolicyBatch, PolicyVAE, PolicyVAEConfig
-
-pytestmark = pytest.mark.light_compilation
 
 SMALL = PolicyVAEConfig(
     latent_dim=8,
@@ -231,6 +230,21 @@ def test_the_units_of_observations_do_not_matter_to_a_normalised_vae():
         policy_vae.encode(plain, plain_params, policies).mean,
     )
     assert policy_vae.with_statistics(plain_params, states) is plain_params
+
+
+@pytest.mark.parametrize("normalised", [True, False])
+def test_policies_are_unfolded_as_the_vae_sees_them_and_folded_back(normalised):
+    policies = _policies(3)
+    vae, params = _vae(policies, normalised=normalised)
+    states = 1.0 + 0.1 * jax.random.normal(jax.random.key(1), (3, 50, 8))
+    params = policy_vae.with_statistics(params, states)
+    policy = jax.tree.map(lambda leaf: leaf[0], policies)
+    seen = vae.apply(params, policy, method="unfold")
+    folded = vae.apply(params, seen, method="fold")
+    chex.assert_trees_all_close(folded, policy, atol=1e-4)
+    kernel, raw = (one["params"]["dense_0"]["kernel"] for one in (seen, policy))
+    expected = raw * states.std(axis=(0, 1))[:, None] if normalised else raw
+    np.testing.assert_allclose(kernel, expected, rtol=1e-4)
 
 
 def test_a_normalised_vae_learns_where_a_plain_one_cannot():

@@ -16,8 +16,6 @@ from haland_jax.networks import MLPActor, MLPCritic
 from haland_jax.ppo import PPOConfig
 from haland_jax.ppo_loss import Batch, generalised_advantages, ppo_loss
 
-pytestmark = pytest.mark.light_compilation
-
 TINY = PPOConfig(
     total_steps=80, num_envs=4, rollout_steps=5, num_minibatches=1, epochs=1, confined_until=0.0
 )

@@ -19,8 +19,6 @@ from experiments.models import instructions_of, open_model
 from haland_jax import bert_weights, checkpoint, compact, networks, policy_vae, pretrained
 from haland_jax.pretrained import BundleError
 
-pytestmark = pytest.mark.light_compilation
-
 SHIPPED = pretrained.names()
 MEGABYTE = 1_000_000
 

@@ -21,7 +21,6 @@ from haland_jax.fit import FitConfig
 MODEL = "pretrained:lbf/spread"
 STYLES, ROUNDS = ("level_2", "level_7"), 80
 CONFIG = CloningConfig(FitConfig(learning_rate=3e-3, steps=1500, warmup_steps=20))
-pytestmark = pytest.mark.light_compilation
 
 
 @pytest.fixture(scope="module")

@@ -241,7 +241,9 @@ def test_a_run_is_recorded_with_pictures_and_links_that_work(tmp_path, readme):
         assert kept.size == (60, 40)
         assert kept.mode == "P"
     text = readme.read_text()
-    assert text.startswith("# Title\n\nbefore\n\n<!-- results -->\n\nFrom sentences never seen")
+    assert text.startswith(
+        "# Title\n\nbefore\n\n<!-- results -->\n\nPreset `quick`: from sentences never seen"
+    )
     assert text.endswith("\n\n<!-- /results -->\n\nafter\n")
     assert "docs/results/overcooked/crossway/report.md" in text
 
@@ -312,6 +314,10 @@ def test_where_methods_were_compared_they_are_drawn(tmp_path):
     assert out / "figures" / "figure_3.png" in record.record([run], out, None)
     assert "(figures/figure_3.png)" in (out / "README.md").read_text()
     assert record.record([], out, None) == []
+    assert out / "figures" / "figure_3.png" in record.record(
+        [finished(tmp_path / "two")], out, None
+    )
+    assert not any((out / "figures").iterdir()), "where nothing is compared nothing is drawn"
 
 
 def test_episodes_are_left_out_before_a_record_grows_too_large(tmp_path, monkeypatch):

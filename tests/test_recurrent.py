@@ -9,8 +9,6 @@ import pytest
 from haland_jax import networks, recurrent
 from haland_jax.recurrent import Memory, RecurrentActor, RecurrentCritic, remember
 
-pytestmark = pytest.mark.light_compilation
-
 STEPS, GAMES, UNITS, INPUTS = 7, 3, 5, 4
 GATES = {"ii": "hi", "if": "hf", "ig": "hg", "io": "ho"}
 """Names of Flax's layers from the input and from the hidden state, in our order."""

@@ -14,8 +14,6 @@ from haland_jax import normalisation, partners, recurrent_egos, recurrent_ppo
 from haland_jax.ppo import PPOConfig
 from haland_jax.recurrent_egos import ADAPTIVE, GENERAL, INSTRUCTED, VARIANTS, Tells
 
-pytestmark = pytest.mark.light_compilation
-
 TINY = PPOConfig(
     total_steps=4 * 8 * 5,
     num_envs=8,

@@ -9,16 +9,7 @@ from rich.console import Console
 
 from experiments import report, summary
 
-
-@pytest.fixture(autouse=True)
-def no_drawing(monkeypatch):
-    """The figures have their own tests; here only their names matter."""
-
-    def name_only(results, folder):
-        folder.mkdir(exist_ok=True)
-        return [folder / "returns_by_style.png", folder / "cross_play.png"]
-
-    monkeypatch.setattr(report, "draw_figures", name_only)
+pytestmark = pytest.mark.usefixtures("no_drawing")
 
 
 def test_the_report_holds_the_numbers(tmp_path):
@@ -70,9 +61,9 @@ def test_successes_are_shown_where_games_can_succeed(tmp_path):
 @pytest.mark.parametrize(
     ("told", "haland", "expected"),
     [
-        (0.8, 0.9, ("the label is worth something", "(90%) is 10% of the Oracle ahead of")),
-        (0.61, 0.5, ("hardly changes", "(50%) is 11% of the Oracle behind")),
-        (0.4, 0.9, ("optimisation, not information", "(90%) is 30% of the Oracle ahead of")),
+        (0.8, 0.9, ("the label is worth something", "(90%) is ahead of", "by 10% of the Oracle")),
+        (0.61, 0.5, ("hardly changes", "(50%) is behind", "two by 11% of the Oracle")),
+        (0.4, 0.9, ("optimisation, not information", "(90%) is ahead of", "by 30% of the Oracle")),
     ],
 )
 def test_what_the_style_is_worth_is_said_in_words(tmp_path, told, haland, expected):

@@ -7,7 +7,9 @@ from pathlib import Path
 import jax
 import numpy as np
 import pytest
+import safetensors.numpy
 from refused_command import refused
+from safetensors import safe_open
 
 from experiments import compare, pipeline, players, record, restore
 from experiments.compared import PLAYER_STAGES, PLAYERS
@@ -17,11 +19,10 @@ from experiments.stages import load_archive, load_population, load_task_language
 from haland_jax import partners
 
 EXAMPLE = Path(__file__).parent.parent / "docs" / "examples" / "retrieval.py"
-pytestmark = pytest.mark.light_compilation
 
 
 @pytest.fixture(scope="module")
-def recorded(smoke_run, tmp_path_factory):
+def recorded(smoke_run, tmp_path_factory, no_drawing):
     """A record of the smoke run, in which a method of somebody's own was measured."""
     folder = tmp_path_factory.mktemp("recorded")
     run = Path(shutil.copytree(smoke_run, folder / "run"))
@@ -118,3 +119,15 @@ def test_half_precision_is_for_policies_that_fit_into_it():
         ("language/by_seed", policy, False),
     ):
         np.testing.assert_array_equal(players._stored(name, array, exact), array)
+
+
+def test_the_same_players_make_the_same_file(tmp_path):
+    arrays = {"a/b": np.arange(6.0).reshape(2, 3), "a/c": np.ones(2, np.float16)}
+    about = {name: f'{{"{name}": "é"}}' for name in ("format", "config", "events", "dropped")}
+    files = {players._in_order(safetensors.numpy.save(arrays, about)) for _ in range(8)}
+    assert len(files) == 1
+    (tmp_path / PLAYERS).write_bytes(files.pop())
+    with safe_open(tmp_path / PLAYERS, "np") as opened:
+        assert opened.metadata() == about
+        for name, array in arrays.items():
+            np.testing.assert_array_equal(opened.get_tensor(name), array)

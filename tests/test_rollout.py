@@ -74,3 +74,23 @@ def test_both_players_draw_with_keys_of_their_own():
     even = Pair(jnp.zeros((1000, 2)), jnp.zeros((1000, 2)))
     ego, partner = rollout.draw_actions(jax.random.key(0), even)
     assert abs(np.mean(np.asarray(ego) == np.asarray(partner)) - 0.5) < 0.08
+
+
+@pytest.mark.parametrize("games_each", [1, 3])
+def test_visited_observations_are_of_games_that_are_on(game, games_each):
+    visited = jax.jit(
+        lambda key: rollout.visited_observations(
+            game,
+            key,
+            always(1, 3, 3),
+            jax.tree.map(lambda leaf: jnp.stack(4 * [leaf]), always(0, 2, 4)),
+            game.style("short"),
+            num_kept=200,
+            games_each=games_each,
+        )
+    )(jax.random.key(0))
+    assert visited.shape == (200, 3)
+    # The short game is over after three steps: times 0, 1 and 2 of 5 are seen, and all of them.
+    np.testing.assert_allclose(np.unique(np.asarray(visited[:, 1])), [0.0, 0.2, 0.4], atol=1e-6)
+    seen = np.unique(np.asarray(visited[:, 2]))
+    assert len(seen) == 4 * games_each, "states of all games are drawn"

@@ -1,15 +1,19 @@
 """Self-play and fictitious co-play: who plays which style, and that both learn."""
 
 import dataclasses
+from types import SimpleNamespace
+from typing import Any
 
 import jax
 import numpy as np
 import pytest
 from toy_game import ToyGame
 
+from experiments.methods.self_play import training_config
 from haland_jax import partners, self_play
 from haland_jax.learner import Learner
 from haland_jax.ppo import PPOConfig
+from haland_jax.universal import universal_config
 
 CONFIG = PPOConfig(
     total_steps=400,
@@ -20,13 +24,22 @@ CONFIG = PPOConfig(
     confined_until=0.0,
 )
 
-pytestmark = pytest.mark.light_compilation
-
 
 @pytest.fixture(scope="module")
 def game():
     # What both earn is 1 when both act as they should: ego 1 or 2, partner 1.
     return ToyGame(ego_weight=1.0, partner_weight=1.0)
+
+
+@pytest.mark.parametrize(
+    ("sharing", "games"),
+    [(8, 192), (72, 216), (7, 224)],
+    ids=["self-play", "co-play", "neither divides the other"],
+)
+def test_games_are_as_few_as_partners_and_minibatches_can_share(sharing, games):
+    universal = SimpleNamespace(training=universal_config(10**6, num_envs=192, num_minibatches=8))
+    run: Any = SimpleNamespace(config=SimpleNamespace(universal=universal))
+    assert training_config(run, 10**6, sharing).num_envs == games
 
 
 def test_the_games_of_a_pair_are_of_all_styles_in_equal_parts(game):

@@ -12,8 +12,6 @@ from haland_jax.fit import FitConfig
 from haland_jax.translator import SentenceData, prepare_sentences
 from tests.test_translator import CONFIG, small_encoder, small_sentences
 
-pytestmark = pytest.mark.light_compilation
-
 QUICK = dataclasses.replace(CONFIG, fine_tuning=FitConfig(learning_rate=1e-2, steps=60))
 
 

@@ -5,9 +5,14 @@ import pytest
 from made_up_results import made_up_results
 
 from experiments import report, results_page, standing
+from experiments.figures.style import FILLS
 from experiments.intervals import Estimate
+from experiments.methods import ablations, fine_tuning, self_play, universal
 from experiments.overview import overview
 from experiments.summary import HEADLINE, UNIVERSAL, UNIVERSAL_WITH_LABEL
+from haland_jax import recurrent_egos
+
+pytestmark = pytest.mark.usefixtures("no_drawing")
 
 
 def measured(**shares: float) -> dict:
@@ -20,15 +25,35 @@ def measured(**shares: float) -> dict:
     return {"styles": styles, "oracle": {style: [10.0] * 3 for style in styles}, "methods": methods}
 
 
-def test_intervals_decide_who_is_ahead():
+def test_the_lead_with_the_same_partners_decides_who_is_ahead():
     def verdict(low: float, high: float) -> str:
-        value = Estimate((low + high) / 2, low, high)
-        return standing.Standing("other", value, Estimate(0.9, 0.85, 0.95), None, None).verdict
+        share, lead = Estimate(0.9, 0.8, 1.0), Estimate((low + high) / 2, low, high)
+        one = standing.Standing("other", share, share, lead, 0.9, 0.8, None, None)
+        assert not one.apart
+        return one.verdict
 
-    assert verdict(0.70, 0.84) == "ahead"
-    assert verdict(0.70, 0.85) == "level"
-    assert verdict(0.95, 0.99) == "level"
-    assert verdict(0.96, 0.99) == "behind"
+    assert verdict(0.01, 0.03) == "ahead"
+    assert verdict(-0.01, 0.03) == "level"
+    assert verdict(0.0, 0.03) == "level"
+    assert verdict(-0.03, -0.01) == "behind"
+
+
+def test_a_lead_is_taken_partner_by_partner():
+    """Partners differ by far more than the two methods, of which one is ahead with each."""
+    results = measured(Other=0.5)
+    levels = {"one": [2.0, 5.0, 8.0], "two": [1.0, 4.0, 9.0]}
+    results["methods"]["Other"] = {name: {"returns": row} for name, row in levels.items()}
+    results["methods"][HEADLINE] = {
+        name: {"returns": [value + more for value, more in zip(row, (0.4, 0.5, 0.6), strict=True)]}
+        for name, row in levels.items()
+    }
+    (found,) = standing.standings(results)
+    assert found.lead.value == pytest.approx(0.05)
+    assert 0.03 < found.lead.low < found.lead.high < 0.07
+    assert found.verdict == "ahead"
+    assert not found.apart
+    assert found.mean == pytest.approx(29 / 60)
+    assert found.lowest == pytest.approx(14 / 30)
 
 
 def test_steps_are_held_against_those_of_all_best_responses():
@@ -43,6 +68,7 @@ def test_steps_are_held_against_those_of_all_best_responses():
     assert (found["Without VAE"].steps, found["Without VAE"].budget) == (None, None)
     assert found["Without VAE"].share == pytest.approx((0.1, 0.1, 0.1))
     assert found["Without VAE"].verdict == "ahead"
+    assert found["Without VAE"].apart
     best = standing.best_ego(standing.standings(results))
     assert best is not None
     assert best.method == UNIVERSAL, "ablations and others are no universal egos"
@@ -64,8 +90,23 @@ def test_of_egos_of_the_same_kind_those_that_learnt_longest_count():
     assert standing.universal_egos(run(400, *longer)) == [*longer, "FCP"]
     assert standing.universal_egos(run(50, *longer)) == [*longer, "FCP", *shorter]
     assert standing.universal_egos(run(400)) == ["FCP", *shorter]
+    assert standing.without_memory(run(400, *longer)) == (*longer, 400)
+    assert standing.without_memory(run(50, *longer)) == (*shorter, 100)
+    assert standing.without_memory(run(400)) == (*shorter, 100)
+    assert standing.without_memory({"methods": {HEADLINE: {}}}) is None
     both = standing.compared([run(400, *longer), run(400)])
     assert both == [HEADLINE, *longer, "FCP", *shorter], "the second run has nothing longer"
+
+
+def test_tables_and_figures_know_all_methods_by_name():
+    egos = {*recurrent_egos.VARIANTS, universal.GENERAL_MLP, universal.INSTRUCTED_MLP}
+    egos |= {self_play.SELF_PLAY, self_play.FCP, UNIVERSAL, UNIVERSAL_WITH_LABEL}
+    parts = {ablations.CGAN_MLP, ablations.CGAN_UNET, ablations.NO_TRANSLATOR, ablations.NO_VAE}
+    assert set(standing.EGOS) == egos
+    assert set(standing.ABLATIONS) == parts
+    further = {ablations.NO_VAE_CLEAN, fine_tuning.NO_FINE_TUNING}
+    assert set(standing.FURTHER_ABLATIONS) == further
+    assert set(FILLS) >= egos | parts | further
 
 
 def test_nothing_to_compare():
@@ -89,9 +130,11 @@ def test_report_and_page_name_the_best_universal_ego(tmp_path):
     row = overview(results)
     assert next(iter(row.shares)) == HEADLINE
     page = results_page.page([row], "")
-    assert f"Haland ({row.shares[HEADLINE]})" in page
-    assert "is ahead of the best universal ego, Universal ego with the style's label" in page
-    assert "(10 M steps, 25% of those of all best responses)" in page
+    assert (
+        "Haland is ahead of Universal ego with the style's label (10 M steps, 25% of those of all "
+        f"best responses): {row.means[HEADLINE][0]:.2f} and 0.78 of the Oracle in the mean" in page
+    )
+    assert "The intervals of the interquartile means are apart." in page
     assert np.isclose(row.shares[HEADLINE].value, 0.92, atol=0.03)
     assert "| General Ego | 20 M (50%) |" in page
     assert f"| {UNIVERSAL} | 10 M (25%) |" in page

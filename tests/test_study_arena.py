@@ -10,7 +10,6 @@ from envs.base import Pair
 from experiments.study.arena import Arena
 from haland_jax.learner import make_networks
 
-pytestmark = pytest.mark.light_compilation
 SEATS, STEPS = 3, 25
 
 

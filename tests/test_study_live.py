@@ -2,6 +2,7 @@
 
 import asyncio
 import contextlib
+import itertools
 import time
 
 import numpy as np
@@ -10,14 +11,13 @@ import pytest
 from experiments.models import open_model
 from experiments.study import live as live_module
 from experiments.study import recording
-from experiments.study.controls import ACT, LEFT, RIGHT, UP, Hands, controls_of
+from experiments.study.controls import ACT, DOWN, LEFT, RIGHT, UP, Hands, controls_of
 from experiments.study.live import Full, message_of
 from experiments.study.store import Store
 from experiments.study.study import Kitchen, Settings, Study, key_of
 from experiments.study.tables import BROKEN, FINISHED, PLAYING
 
 MODEL = "pretrained:lbf/spread"
-pytestmark = pytest.mark.light_compilation
 
 
 @pytest.fixture(scope="module")
@@ -182,10 +182,14 @@ def test_a_browser_is_told_what_changed(study):
         assert len(first["tiles"]) == 81
         assert set(first["pictures"]) == known
         there(live)
-        live.hands.press(UP)
-        board = live.board
+        board, ways = live.board, itertools.cycle((UP, LEFT, DOWN, RIGHT))
+
+        def somebody_moved():
+            live.hands.press(next(ways))  # a wall or food may be in one way, and the agent may wait
+            return live.board != board
+
         async with running(study.hall):
-            await until(lambda: live.step > 2)
+            await until(somebody_moved)
         following = message_of(live, study.hall.pictures, board, known)
         assert 0 < len(following["tiles"]) < 10
         assert following["step"] == live.step

@@ -26,9 +26,6 @@ class Killed(BaseException):
     """Stands for a process that dies."""
 
 
-pytestmark = pytest.mark.light_compilation
-
-
 def train(path, *, updates_per_piece: int, seeds: int = 2, between=None, die_after=None):
     """Trains a population of the toy game; dies once so many updates are reported."""
     game, reported = ToyGame(), []

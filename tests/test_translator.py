@@ -28,8 +28,6 @@ from haland_jax.translator import (
     translation_loss,
 )
 
-pytestmark = pytest.mark.light_compilation
-
 ARCHITECTURE = BertArchitecture(
     vocabulary=40, width=16, layers=3, heads=2, intermediate_width=32, positions=32
 )

@@ -19,8 +19,6 @@ from haland_jax.partners import Player
 from haland_jax.ppo import PPOConfig
 from haland_jax.universal import UniversalConfig
 
-pytestmark = pytest.mark.light_compilation
-
 TINY = PPOConfig(
     total_steps=80, num_envs=8, rollout_steps=5, num_minibatches=2, epochs=1, confined_until=0.0
 )

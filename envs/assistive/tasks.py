@@ -128,7 +128,7 @@ def first_progress(style: Style) -> Progress:
     """Nothing is done and the tool is full; the first stroke may be anywhere."""
     holds = jnp.array([0, 0, PORTIONS, UNITS], jnp.int32)
     nothing = jnp.zeros((), jnp.int32)
-    return Progress(nothing, nothing, holds[style.task], jnp.full(3, 10.0))
+    return Progress(nothing, nothing, holds[style.task], jnp.full(3, 10.0, jnp.float32))
 
 
 def find_target(poses: Poses, style: Style, aim: Aim, progress: Progress) -> Target:

@@ -1,7 +1,7 @@
 """Draws the paper's figures from the results of runs, and nothing else.
 
     python -m experiments.figures runs/*-overnight-0 --out figures
-    python -m experiments.figures docs/results/*/*
+    python -m experiments.figures docs/results/*/*/
 
 Each as PNG and PDF: Fig. 3 (all methods in all environments), 4 (Adaptive Egos by seed), 5 and 12
 (strips of games), 6a and 6b (sentences), 8 to 11 (events), Table 1, and how universal egos learnt.
@@ -17,9 +17,10 @@ import tyro
 from rich.console import Console
 from rich.table import Table
 
+from experiments.devices import usable_cores
 from experiments.errors import UserError, main_guard
 from experiments.figures import paper
-from experiments.figures.reading import read_runs
+from experiments.reading import read_runs
 from experiments.standing import gain, improvement_in_words
 
 MISSING = {
@@ -51,7 +52,7 @@ def main() -> None:
         raise UserError("name at least one run: a folder with a results.json")
     start = time.monotonic()
     runs = read_runs(arguments.runs)
-    drawn = paper.draw_paper(runs, arguments.out)
+    drawn = paper.draw_paper(runs, arguments.out, processes=usable_cores())
     console = Console()
     environments = f"{len(runs)} environment{'s' * (len(runs) != 1)}"
     table = Table(title=f"figures of {environments}, {time.monotonic() - start:.0f} s")

@@ -19,6 +19,7 @@ from experiments.figures.style import (
     words,
     wrap,
 )
+from experiments.standing import EGOS
 from experiments.summary import HEADLINE, METHODS, ORACLE, mean, ratios, returns, shares, spread
 from experiments.summary import ordered_methods as methods_of
 
@@ -81,10 +82,13 @@ def returns_by_style(results: Mapping[str, Any]) -> Figure:
 
 
 def comparisons_by_style(results: Mapping[str, Any]) -> Figure | None:
-    """Bars of the return by style: Haland beside the ablations and baselines, if there are any."""
+    """Return by style: Haland beside universal egos, and below that beside all else; if any."""
     others = [name for name in methods_of(results) if name not in METHODS]
     ours = [name for name in (ORACLE, HEADLINE) if name in methods_of(results)]
-    return grouped_bars(results, [*ours, *others]) if others else None
+    egos = [name for name in EGOS if name in others]
+    rest = [name for name in others if name not in EGOS]
+    panels = [[*ours, *some] for some in (egos, rest) if some]
+    return grouped_bars(results, *panels) if panels else None
 
 
 def learning_curves(results: Mapping[str, Any]) -> Figure:
@@ -181,28 +185,40 @@ def cross_play(results: Mapping[str, Any]) -> Figure:
     return figure
 
 
-def grouped_bars(results: Mapping[str, Any], methods: Sequence[str]) -> Figure:
-    """Bars of the return by style, a bar a method, with deviations over seeds."""
+def grouped_bars(results: Mapping[str, Any], *panels: Sequence[str]) -> Figure:
+    """Bars of the return by style, a bar a method, a dot a held-out partner.
+
+    Args:
+        results: the content of results.json.
+        panels: the methods of each panel.
+    """
     styles = results["styles"]
-    figure = new_figure(max(6.0, 1.35 * len(styles)), 3.9)
-    axes = figure.add_subplot()
-    fills = fills_of(methods)
-    width = 0.84 / len(methods)
-    for index, method in enumerate(methods):
-        values = returns(results, method)  # [style, seed]
-        colour, hatch = fills[method]
-        axes.bar(
-            np.arange(len(styles)) + (index - (len(methods) - 1) / 2) * width, values.mean(axis=1),
-            width, yerr=[spread(row) for row in values], label=method, color=colour, hatch=hatch,
-            edgecolor="black", linewidth=0.5, ecolor="black",
-            error_kw={"elinewidth": 0.9, "capsize": 1.5},
-        )  # fmt: skip
-    axes.set_xticks(range(len(styles)), [wrap(style) for style in styles])
-    axes.tick_params(axis="x", length=0)
-    axes.set_axisbelow(True)
-    axes.grid(axis="y", color="#dddddd", linewidth=0.6)
-    axes.margins(x=0.01)
-    axes.set_ylabel("return per episode")
+    methods = list(dict.fromkeys(method for panel in panels for method in panel))
+    figure = new_figure(max(6.0, 1.35 * len(styles)), 1.2 + 2.7 * len(panels))
+    fills, labelled = fills_of(methods), set()
+    every = figure.subplots(len(panels), 1, sharey=True, squeeze=False)[:, 0]
+    for axes, shown in zip(every, panels, strict=True):
+        width = 0.84 / len(shown)
+        for index, method in enumerate(shown):
+            values = returns(results, method)  # [style, seed]
+            places = np.arange(len(styles)) + (index - (len(shown) - 1) / 2) * width
+            colour, hatch = fills[method]
+            axes.bar(
+                places, values.mean(axis=1), width, color=colour, hatch=hatch, edgecolor="black",
+                linewidth=0.5, label=None if method in labelled else method,
+            )  # fmt: skip
+            labelled.add(method)
+            axes.plot(
+                np.repeat(places, values.shape[1]), values.ravel(), "o", markersize=2.2,
+                color="white", markeredgecolor="black", markeredgewidth=0.5, linestyle="none",
+            )  # fmt: skip
+        axes.set_xticks(range(len(styles)), [wrap(style) for style in styles])
+        axes.tick_params(axis="x", length=0)
+        axes.set_axisbelow(True)
+        axes.grid(axis="y", color="#dddddd", linewidth=0.6)
+        axes.axhline(0.0, color="black", linewidth=0.6)
+        axes.margins(x=0.01)
+        axes.set_ylabel("return per episode\n(dots: held-out partners)")
     figure.legend(loc="outside upper center", ncols=min(4, len(methods)), frameon=False)
     return figure
 

@@ -1,5 +1,7 @@
 """The paper's figures and Table 1 from the results of several runs."""
 
+import concurrent.futures
+import multiprocessing
 from collections.abc import Callable, Collection, Sequence
 from pathlib import Path
 from typing import NamedTuple
@@ -56,16 +58,21 @@ def normalised_returns(runs: Sequence[Results]) -> Figure:
     figure = new_figure(max(7.4, 1.7 * len(groups)), 3.0 + 0.2 * rows)
     axes = figure.add_subplot()
     fills = fills_of(methods)
-    width = 0.84 / len(methods)
+    width, lacking = 0.84 / len(methods), False
     for index, method in enumerate(methods):
         found = [estimates(group, method) for group in groups.values()]
+        offset = (index - (len(methods) - 1) / 2) * width
+        for place, one in enumerate(found):
+            if one is None:
+                axes.text(place + offset, 0.0, "–", ha="center", va="bottom", color="#575757")
+                lacking = True
         places = [place for place, one in enumerate(found) if one is not None]
         shown = [one for one in found if one is not None]
         if not shown:
             continue
         colour, hatch = fills[method]
         axes.bar(
-            np.array(places) + (index - (len(methods) - 1) / 2) * width,
+            np.array(places) + offset,
             [one.value for one in shown], width, color=colour, hatch=hatch, edgecolor="black",
             linewidth=0.5, ecolor="black", label=method.removesuffix(", test sentences"),
             yerr=np.array([[one.value - one.low, one.high - one.value] for one in shown]).T,
@@ -76,7 +83,9 @@ def normalised_returns(runs: Sequence[Results]) -> Figure:
     axes.tick_params(axis="x", length=0)
     axes.set_axisbelow(True)
     axes.grid(axis="y", color="#dddddd", linewidth=0.6)
-    axes.set_ylabel("return / Oracle (interquartile mean, 95%)")
+    axes.set_ylabel("return / Oracle, interquartile mean\n(whiskers: its 95% interval)")
+    if lacking:
+        axes.set_title("–: not measured", loc="right", fontsize=8)
     if axes.containers:
         figure.legend(loc="outside upper center", ncols=LEGEND_COLUMNS, frameon=False)
     return figure
@@ -164,9 +173,9 @@ def ablation_bars(results: Results) -> Figure:
 def universal_learning(results: Results) -> Figure:
     """Not in the paper: how the universal egos learnt, and whether they had learnt all they could.
 
-    Return of training games by environment steps of an ego, a line a kind (mean over its seeds).
-    Games that start at a random moment, with soups half made, earn more, and grow fewer in the
-    second half.
+    Return of training games by environment steps of an ego, a line a kind (mean over its seeds). In
+    the kitchens some of the games start at a random moment, with soups half made; their share falls
+    in the second half of the training, and with it the return.
     """
     figure = new_figure(6.4, 3.6)
     axes = figure.add_subplot()
@@ -176,12 +185,12 @@ def universal_learning(results: Results) -> Figure:
             axes.plot(
                 np.asarray(trained["curve_steps"], float) / 1e6,
                 np.asarray(curves, float).mean(axis=0),
-                label=name, linewidth=1.2, markersize=4, markevery=4,
-                marker=_MARKERS[number % len(_MARKERS)],
+                label=name, linewidth=1.4, markersize=4.5, markevery=4, markeredgewidth=0.5,
+                marker=_MARKERS[number % len(_MARKERS)], color=fills_of([name])[name][0],
+                markeredgecolor="black",
             )  # fmt: skip
     axes.set_xlabel("environment steps of an ego (millions)")
     axes.set_ylabel("return of training games")
-    axes.set_title("games that start at random moments earn more, and grow fewer", fontsize=8)
     axes.grid(axis="y", color="#dddddd", linewidth=0.6)
     axes.set_xlim(left=0)
     figure.legend(loc="outside right upper", frameon=False)
@@ -258,7 +267,11 @@ FIGURES = {
 
 
 def draw_paper(
-    runs: Sequence[Results], folder: Path, names: Collection[str] = FIGURES
+    runs: Sequence[Results],
+    folder: Path,
+    names: Collection[str] = FIGURES,
+    *,
+    processes: int = 1,
 ) -> dict[str, list[Path]]:
     """Draws all figures whose numbers are there.
 
@@ -266,24 +279,46 @@ def draw_paper(
         runs: contents of results.json, one an environment.
         folder: where the files go; made if it is missing.
         names: which figures; all by default.
+        processes: how many draw at the same time, an environment each; 1: none but this one.
 
     Returns:
         By figure, its files; a figure that no run has the numbers for has none.
     """
     folder.mkdir(parents=True, exist_ok=True)
-    drawn: dict[str, list[Path]] = {}
+    # The figures of an environment in one process, for what they share.
+    tasks: dict[str, list[tuple[str, Sequence[Results]]]] = {}
     for name in names:
-        drawing = FIGURES[name]
-        having = [run for run in runs if drawing.runs(run)]
-        drawn[name] = []
-        with matplotlib.rc_context(STYLE):
-            if drawing.together and having:
-                drawn[name].append(save(drawing.draw(having), folder, name))
-            for run in [] if drawing.together else having:
-                drawn[name].append(save(drawing.draw(run), folder, f"{name}_{_short(run)}"))
+        having = [run for run in runs if FIGURES[name].runs(run)]
+        if FIGURES[name].together and having:
+            tasks.setdefault("", []).append((name, having))
+        elif not FIGURES[name].together:
+            for run in having:
+                tasks.setdefault(_short(run), []).append((name, [run]))
+    folders = [folder] * len(tasks)
+    if processes > 1 and len(tasks) > 1:
+        spawned = multiprocessing.get_context("spawn")
+        with concurrent.futures.ProcessPoolExecutor(processes, spawned) as pool:
+            found = list(pool.map(_draw, tasks.values(), folders))
+    else:
+        found = list(map(_draw, tasks.values(), folders))
+    drawn: dict[str, list[Path]] = {name: [] for name in names}
+    for some, files in zip(tasks.values(), found, strict=True):
+        for (name, _), file in zip(some, files, strict=True):
+            drawn[name].append(file)
     for run in runs:
         if "table_1" in names and FIGURES["table_1"].runs(run):
             file = folder / f"table_1_{_short(run)}.md"
             file.write_text(f"{table_1(run)}\n", encoding="utf-8")
             drawn["table_1"].append(file)
     return drawn
+
+
+def _draw(tasks: Sequence[tuple[str, Sequence[Results]]], folder: Path) -> list[Path]:
+    """Draws figures, each by name of the runs that it shows."""
+    files = []
+    for name, runs in tasks:
+        together, draw = FIGURES[name].together, FIGURES[name].draw
+        stem = name if together else f"{name}_{_short(runs[0])}"
+        with matplotlib.rc_context(STYLE):
+            files.append(save(draw(runs if together else runs[0]), folder, stem))
+    return files

@@ -1,5 +1,6 @@
 """Fig. 5 and 12: what both players do in a game, in a strip of its moments."""
 
+import functools
 from collections.abc import Mapping, Sequence
 from typing import Any
 
@@ -12,6 +13,9 @@ from experiments.gallery import STRIP, state_of
 
 WIDTH = 1.75
 """Of a picture, inches."""
+
+_environment = functools.lru_cache(maxsize=8)(envs.make)
+"""The same one for both figures of an environment, so that its states are traced once."""
 
 
 def strip_of_two(results: Mapping[str, Any]) -> Figure:
@@ -32,7 +36,7 @@ def strips(results: Mapping[str, Any], styles: Sequence[str]) -> Figure:
         results: the content of results.json, with `episodes`.
         styles: which of its styles.
     """
-    env = envs.make(results["environment"])
+    env = _environment(results["environment"])
     pictures = {style: _pictures(env, style, results["episodes"][style]) for style in styles}
     height, width = next(iter(pictures.values()))[0].shape[:2]
     row = WIDTH * height / width + 0.8

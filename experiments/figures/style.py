@@ -47,6 +47,7 @@ FILLS = {
     "CGAN (UNet)": ("#5fa8a3", ""),
     "Without translator": ("#cfe8e6", "xx"),
     "Without VAE": ("#2f6f6b", ""),
+    "Without VAE (clean)": ("#2f6f6b", "//"),
     "Without fine-tuning": ("#5fa8a3", "//"),
     UNIVERSAL: ("#c9d8c0", ""),
     UNIVERSAL_WITH_LABEL: ("#6f8f6b", ""),
@@ -63,6 +64,7 @@ OTHER_FILLS = (
 def save(figure: Figure, folder: Path, name: str) -> Path:
     """Writes `<name>.png` and `<name>.pdf`; returns the PNG."""
     figure.savefig(folder / f"{name}.png", dpi=DOTS_PER_INCH)
+    figure.set_layout_engine("none")  # found already; the PDF has the same
     figure.savefig(folder / f"{name}.pdf", metadata={"CreationDate": None})
     return folder / f"{name}.png"
 

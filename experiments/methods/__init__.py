@@ -21,6 +21,7 @@ ABLATIONS: dict[str, Method] = {
     "cgan-unet": WithoutDiffusion("unet"),
     "no-translator": WithoutTranslator(),
     "no-vae": WithoutVAE(),
+    "no-vae-clean": WithoutVAE(clean=True),
     "no-fine-tuning": WithoutFineTuning(),
 }
 """Haland without a part (Table 1); they need no games."""

@@ -20,12 +20,12 @@ from experiments.stages import (
 from experiments.training import run_fit
 from haland_jax import bert_weights, cgan, diffusion, fit, partners, translator
 from haland_jax.cgan import CGANConfig, LabelledLatents
-from haland_jax.diffusion import LatentArchive
+from haland_jax.diffusion import CleanDiffusionConfig, LatentArchive
 from haland_jax.fit import FitConfig
 from haland_jax.networks import Policy
 
 CGAN_MLP, CGAN_UNET = "CGAN (MLP)", "CGAN (UNet)"
-NO_TRANSLATOR, NO_VAE = "Without translator", "Without VAE"
+NO_TRANSLATOR, NO_VAE, NO_VAE_CLEAN = "Without translator", "Without VAE", "Without VAE (clean)"
 SENTENCE_TOKENS = 8
 """Tokens that a sentence's embedding becomes."""
 LEAST_DEVIATION = 1e-3
@@ -84,7 +84,8 @@ class WithoutDiffusion:
             policy: Any = vae.apply(vae_params, z, method="decode")
             return policy
 
-        what = f"a conditional GAN with the {self.generator} for the diffusion, told the label"
+        generator = {"mlp": "an MLP", "unet": "the UNet"}[self.generator]
+        what = f"a conditional GAN with {generator} in place of the diffusion, told the label"
         return Trained(
             egos={self.name: lambda told, key: generate(key, told.style)},
             descriptions={self.name: what},
@@ -146,16 +147,25 @@ class WithoutTranslator:
         return Trained(
             egos={NO_TRANSLATOR: lambda told, key: generate(key, embed([told.sentence])[0])},
             descriptions={
-                NO_TRANSLATOR: "the diffusion is told the sentence's embedding by the BERT that "
-                "nobody fine-tuned"
+                NO_TRANSLATOR: "the diffusion is told the sentence's embedding by BERT without "
+                "fine-tuning"
             },
         )
 
 
 class WithoutVAE:
-    """The diffusion makes a policy's parameters themselves."""
+    """The diffusion makes a policy's parameters themselves, in the units that the VAE sees.
+
+    Args:
+        clean: whether the UNet gives the parameters (`CleanDiffusionConfig`), since there are more
+            of them than can pass through it at once; otherwise all is as in Haland.
+    """
 
     budgeted = False
+
+    def __init__(self, clean: bool = False):
+        self.clean = clean
+        self.name = NO_VAE_CLEAN if clean else NO_VAE
 
     def num_updates(self, run: Run, steps: int) -> int:
         """As many as the diffusion's fit has."""
@@ -164,13 +174,17 @@ class WithoutVAE:
 
     def train(self, given: Given) -> Trained:
         """Fits the diffusion on the best responses' parameters, a grid with many channels."""
+        vae, vae_params, _ = load_vae(given.run)
         policies = partners.flatten(load_archive(given.run).egos.actor)
+        policies = jax.vmap(lambda policy: vae.apply(vae_params, policy, method="unfold"))(policies)
         flat = jax.vmap(lambda policy: ravel_pytree(policy)[0])(policies)
         _, unravel = ravel_pytree(jax.tree.map(lambda leaf: leaf[0], policies))
         size = flat.shape[1]
         height, width, _ = given.run.config.diffusion.grid
         channels = -(-size // (height * width))
         config = dataclasses.replace(given.run.config.diffusion, grid=(height, width, channels))
+        if self.clean:
+            config = CleanDiffusionConfig.like(config)
         padded = jnp.pad(flat, ((0, 0), (0, config.latent_size - size)))
         v_hat = load_task_language(given.run).v_hat
         archive = LatentArchive(
@@ -183,15 +197,17 @@ class WithoutVAE:
 
         @jax.jit
         def generate(key: jax.Array, v_hat: jax.Array) -> Policy:
-            return unravel(diffusion.sample(key, params, v_hat, config)[:size])
+            policy = unravel(diffusion.sample(key, params, v_hat, config)[:size])
+            folded: Any = vae.apply(vae_params, policy, method="fold")
+            return folded
 
         def make(told: Told, key: jax.Array) -> Policy:
             return generate(key, haland.translate([told.sentence])[0][0])
 
-        return Trained(
-            egos={NO_VAE: make},
-            descriptions={NO_VAE: f"the diffusion makes all {size:,} parameters of a policy"},
-        )
+        what = f"the diffusion makes all {size:,} parameters of a policy"
+        if self.clean:
+            what += "; its UNet gives these, not a velocity"
+        return Trained(egos={self.name: make}, descriptions={self.name: what})
 
 
 def _pretrained_embedding(run: Run) -> Any:

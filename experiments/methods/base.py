@@ -2,7 +2,7 @@
 
 A method is given the training partners of a finished run and what the run made of them. It trains
 whatever it wants and returns, by name, how it makes an ego: from what it is told about a partner, a
-policy or an `Agent` (which may remember, and sees what the partner did last). It never meets the
+policy or an `Agent` (which may remember, and sees what the partner did last). It must not use the
 held-out partners, with which `python -m experiments.compare` judges it.
 """
 
@@ -19,6 +19,7 @@ from experiments.training import Saver
 from haland_jax import checkpoint, partners
 from haland_jax.networks import Policy
 from haland_jax.partners import Player
+from haland_jax.ppo_loss import PPOConfig
 from haland_jax.rollout import Agent
 
 EGOS = "egos"
@@ -65,7 +66,8 @@ class Given:
     """What a method may learn from.
 
     Attributes:
-        run: the finished run, for those that use more of it, such as its policy VAE.
+        run: the finished run, for those that use more of it, such as its policy VAE; its held-out
+            partners, their Oracles and the test sentences are for the judge alone.
         key: of all randomness.
         steps: environment steps that an ego may take; by default as many as all best responses of
             the run took together.
@@ -115,6 +117,10 @@ class Given:
     def saver(self, name: str) -> Saver:
         """Keeps the state of a long training, so that an interrupted one goes on."""
         return Saver(self.path(f"unfinished_{name}"))
+
+    def saver_of(self, training: PPOConfig) -> Saver:
+        """As `saver`, for egos that learn in games; other lengths or numbers start anew."""
+        return self.saver(f"{training.num_updates}_updates_{self.seeds}_seeds")
 
 
 class Method(Protocol):

@@ -60,7 +60,7 @@ class WithoutFineTuning:
 
         return Trained(
             egos={NO_FINE_TUNING: make},
-            descriptions={NO_FINE_TUNING: "Haland with the BERT that nobody fine-tuned"},
+            descriptions={NO_FINE_TUNING: "Haland with BERT without fine-tuning"},
             notes={
                 "translations": {
                     "before": _translations(untuned, run),

@@ -1,6 +1,7 @@
 """Two more universal egos: self-play, and fictitious co-play (FCP)."""
 
 import dataclasses
+import math
 from typing import Any
 
 import jax
@@ -34,9 +35,9 @@ def training_config(run: Run, steps: int, sharing: int) -> PPOConfig:
         ValueError: too few steps.
     """
     training = run.config.universal.training
-    each = -(-training.num_envs // sharing)
-    each += -each % training.num_minibatches
-    return dataclasses.replace(training, total_steps=steps, num_envs=each * sharing)
+    least = math.lcm(sharing, training.num_minibatches)
+    games = -(-training.num_envs // least) * least
+    return dataclasses.replace(training, total_steps=steps, num_envs=games)
 
 
 class SelfPlay:
@@ -57,7 +58,7 @@ class SelfPlay:
             training,
             lambda: self_play.init_self_play(env, training, given.key, given.seeds),
             self_play.all_styles_for(env, given.seeds),
-            given.saver(f"{training.num_updates}_updates_{given.seeds}_seeds"),
+            given.saver_of(training),
             given.task.update,
             "self-play",
         )
@@ -98,7 +99,7 @@ class FictitiousCoPlay:
             ego_config,
             lambda: self_play.init_co_play(env, ego_config, ego_key, pool, given.seeds),
             self_play.all_styles_for(env, given.seeds),
-            given.saver(f"{ego_config.num_updates}_updates_{given.seeds}_seeds"),
+            given.saver_of(ego_config),
             lambda done, metrics: given.task.update(first + done, metrics),
             "fictitious co-play",
         )

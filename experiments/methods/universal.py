@@ -64,7 +64,7 @@ class RecurrentEgos:
             training,
             recurrent_ppo.init_recurrent(env, training, given.key, given.partners, given.seeds),
             lambda updates: recurrent_ppo.compile_recurrent(env, training, updates),
-            given.saver(f"{training.num_updates}_updates_{given.seeds}_seeds"),
+            given.saver_of(training),
             given.task.update,
             "universal egos with a memory",
         )
@@ -101,7 +101,7 @@ class FeedForwardEgos:
             training,
             lambda: universal.init_universal(env, config, given.key, given.partners),
             universal.member_styles(env, given.seeds),
-            given.saver(f"{training.num_updates}_updates_{given.seeds}_seeds"),
+            given.saver_of(training),
             given.task.update,
             "universal egos without a memory",
         )

@@ -17,7 +17,6 @@ from haland_jax import best_responses, checkpoint, partners, task_language
 from haland_jax.networks import Policy
 from haland_jax.partners import Player, Population
 from haland_jax.task_language import TaskLanguage
-from haland_jax.universal import TOLD_THE_STYLE
 
 STARTS = ("own ego", "universal ego")
 """Where the refits of best responses start."""
@@ -57,46 +56,67 @@ def _refit_egos(
 ) -> tuple[Player, dict[str, Any]]:
     """The archive's egos [style, train_seeds], and what each start brought them."""
     config, env = run.config.partners, run.env
-    told = None
+    teachers = partners.teachers(env, config, population)
+    universal, of_universal = None, {}
     if config.universal_start:
-        by_seed = load_universal(run)[TOLD_THE_STYLE]
-        told = jax.tree.map(lambda leaf: leaf[:, 0], by_seed)
-    starts = STARTS if told is not None else STARTS[:1]
+        key = jax.random.fold_in(choice_key, 1)
+        universal, of_universal = _best_universal_egos(run, key, teachers)
+    starts = STARTS if universal is not None else STARTS[:1]
     times = len(starts) * config.train_seeds
     refitted, _ = train_population(
         env,
         config.refit,
-        lambda: best_responses.best_response_refits(env, config, refit_key, population, told),
+        lambda: best_responses.best_response_refits(env, config, refit_key, population, universal),
         partners.repeat_styles(env, times),
         Saver(run.path("best_responses", "unfinished_refits")),
         task.update,
         "best responses",
     )
-    num_styles = len(env.style_names)
-    egos = partners.unflatten(refitted.ego, num_styles)
-
-    teachers = partners.teachers(env, config, population)
-    count = jax.tree.leaves(teachers)[0].shape[1]
-    each = jax.tree.map(lambda leaf: jnp.repeat(leaf, count, axis=1), egos.actor)
-    everyone = jax.tree.map(
-        lambda leaf: jnp.tile(leaf, (1, times) + (1,) * (leaf.ndim - 2)), teachers
+    egos = partners.unflatten(refitted.ego, len(env.style_names))
+    returns = _returns_with_all(run, choice_key, egos.actor, teachers).reshape(
+        len(env.style_names), len(starts), config.train_seeds
     )
-    returns = mean_returns(
-        run,
-        choice_key,
-        partners.flatten(each),
-        partners.flatten(everyone),
-        times * count,
-    ).reshape(num_styles, len(starts), config.train_seeds, count)
-    kept, places = best_responses.best_egos(egos, returns.mean(axis=3))
+    kept, places = best_responses.best_egos(egos, returns)
     chosen = places[:, 0] // config.train_seeds
     return kept, {
         "starts": {name: starts[i] for name, i in zip(env.style_names, chosen, strict=True)},
-        "start_returns": {
-            start: returns.mean(axis=3)[:, index] for index, start in enumerate(starts)
-        },
+        "start_returns": {start: returns[:, index] for index, start in enumerate(starts)},
         "kept_egos": places % config.train_seeds,
+        **of_universal,
     }
+
+
+def _best_universal_egos(
+    run: Run, key: jax.Array, teachers: Policy
+) -> tuple[Player, dict[str, Any]]:
+    """The universal ego that earns most with each style's partners, [style], and which it is."""
+    by_variant = load_universal(run)
+    names = [variant for variant, egos in by_variant.items() for _ in range(_num_egos(egos))]
+    egos = jax.tree.map(lambda *parts: jnp.concatenate(parts, axis=1), *by_variant.values())
+    returns = _returns_with_all(run, key, egos.actor, teachers)
+    best = returns.argmax(axis=1)
+    chosen = {style: names[i] for style, i in zip(run.env.style_names, best, strict=True)}
+    return (
+        jax.tree.map(lambda leaf: leaf[np.arange(len(best)), best], egos),
+        {"universal_starts": chosen, "universal_start_returns": returns},
+    )
+
+
+def _returns_with_all(run: Run, key: jax.Array, egos: Policy, teachers: Policy) -> np.ndarray:
+    """Mean return of each ego [style, ego] with all its style's teachers [style, teacher]."""
+    count, times = _num_egos(teachers), _num_egos(egos)
+    each = jax.tree.map(lambda leaf: jnp.repeat(leaf, count, axis=1), egos)
+    everyone = jax.tree.map(
+        lambda leaf: jnp.tile(leaf, (1, times) + (1,) * (leaf.ndim - 2)), teachers
+    )
+    pairs = partners.flatten(each), partners.flatten(everyone)
+    returns = mean_returns(run, key, *pairs, times * count)
+    return returns.reshape(len(returns), times, count).mean(axis=2)
+
+
+def _num_egos(by_style: Any) -> int:
+    """How many there are of each style, from leading axes [style, ego]."""
+    return jax.tree.leaves(by_style)[0].shape[1]
 
 
 def _find_oracles(

@@ -20,6 +20,7 @@ from haland_jax import (
     fit,
     partners,
     policy_vae,
+    rollout,
     translator,
 )
 from haland_jax.bert import BertArchitecture
@@ -30,6 +31,9 @@ from haland_jax.networks import Policy
 from haland_jax.partners import Population
 from haland_jax.policy_vae import PolicyVAE
 from haland_jax.population import over_population
+
+STEPS_FOR_A_STATE = 4
+"""Steps of full games from which one state is drawn, so that few are drawn twice."""
 
 
 def fit_policy_vae(run: Run, task: StageProgress) -> dict[str, Any]:
@@ -104,7 +108,13 @@ class Visits:
         self.teachers = partners.teachers(run.env, run.config.partners, population)
         wanted = run.config.compression
         most = max(wanted.own_states, wanted.other_states, wanted.decoded_states)
-        visit = partial(partners.visited_observations, run.env, num_kept=most)
+        steps = jax.tree.leaves(self.teachers)[0].shape[1] * run.config.max_steps
+        visit = partial(
+            rollout.visited_observations,
+            run.env,
+            num_kept=most,
+            games_each=-(-STEPS_FOR_A_STATE * most // steps),
+        )
         self._visited = over_population(visit, compiler_options=run.env.compiler_options)
 
     def own_partners(self, key: jax.Array, policies: Policy, number: int) -> jax.Array:

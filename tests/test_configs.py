@@ -1,0 +1,30 @@
+"""The presets, and how they change for an environment."""
+
+import pytest
+
+import envs
+from experiments import configs
+
+NAMES = envs.names(styled_only=True)
+
+
+@pytest.mark.parametrize("preset", configs.PRESETS)
+@pytest.mark.parametrize("environment", NAMES)
+def test_every_preset_is_a_run_of_every_environment(environment, preset):
+    config = configs.PRESETS[preset](environment, 3)
+    assert (config.environment, config.preset, config.seed) == (environment, preset, 3)
+    known = config.partners
+    for training in (known.joint, known.refit, known.oracle, config.universal.training):
+        assert training.num_updates > 0
+    assert set(configs.ADAPTATIONS) <= set(NAMES)
+
+
+def test_where_best_responses_start_from_the_universal_ego_it_learns_for_long():
+    plain = configs.quick("overcooked/diverse_coordination", 0)
+    assert not plain.partners.universal_start
+    kitchen = configs.quick("overcooked/center_pots", 0)
+    assert kitchen.partners.universal_start
+    assert kitchen.universal.training.total_steps == 10_000_000
+    assert kitchen.partners.refit == plain.partners.refit
+    larger = configs.overnight("overcooked/center_pots", 0)
+    assert larger.universal == configs.overnight("overcooked/crossway", 0).universal
