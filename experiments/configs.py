@@ -62,12 +62,14 @@ ADAPTATIONS = {
     "overcooked/crossway": Adaptation(length=1.7, universal_start={"quick": 20_000_000}),
     # Pairs must learn to share the work in two rooms, and otherwise keep to the nearer pot: the
     # farther one pays some fifty steps after the first ingredient is put into it. `quick` has
-    # fewer steps and is content with the nearer pot.
+    # fewer steps and is content with the nearer pot. Refits of their egos jam with some partners
+    # that they have not met, an ego that has met all styles hardly ever does.
     "overcooked/diverse_orders": Adaptation(
         length=4.0,
         joint_steps={"quick": 1_800_000},
         refit_length=2.0,
         joint={"entropy": 0.04, "final_entropy": 0.005},
+        universal_start={"quick": 20_000_000},
         training={"discount": 0.995},
     ),
     # Learnt within 200,000 steps; the target pays 1 where a soup pays 20. Others reach nearly all

@@ -24,7 +24,7 @@ def test_where_best_responses_start_from_the_universal_ego_it_learns_for_long():
     assert not plain.partners.universal_start
     kitchen = configs.quick("overcooked/center_pots", 0)
     assert kitchen.partners.universal_start
-    assert kitchen.universal.training.total_steps == 10_000_000
+    assert kitchen.universal.training.total_steps == 20_000_000
     assert kitchen.partners.refit == plain.partners.refit
     larger = configs.overnight("overcooked/center_pots", 0)
     assert larger.universal == configs.overnight("overcooked/crossway", 0).universal
