@@ -118,6 +118,8 @@ def no_drawing():
 def postgres():
     """A PostgreSQL server for these tests."""
     if databases.postgres_programs() is None:
+        if os.environ.get("HALAND_NEEDS_POSTGRES"):
+            pytest.fail("HALAND_NEEDS_POSTGRES is set, but PostgreSQL's server is not found")
         pytest.skip("PostgreSQL's server is not installed")
     with databases.postgres_server() as url:
         yield url
