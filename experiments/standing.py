@@ -194,7 +194,7 @@ def gain(run: Results) -> Gain | None:
         return None
     ours = returns(run, HEADLINE).mean()
     theirs = np.array([returns(run, name).mean() for name in others])
-    with np.errstate(divide="ignore"):
+    with np.errstate(divide="ignore", invalid="ignore"):
         each = np.where(theirs > 0, ours / theirs - 1, np.nan)
     best = np.argmax([mean(ratios(run, name)) for name in others])
     return Gain(float(each[best]), mean(each))

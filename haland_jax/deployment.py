@@ -8,7 +8,7 @@ import jax
 import jax.numpy as jnp
 from flax.struct import PyTreeNode
 
-from haland_jax import bert_weights, diffusion, task_language
+from haland_jax import bert_weights, samplers, task_language
 from haland_jax.diffusion import DiffusionConfig, DiffusionParams
 from haland_jax.hypernetwork import PolicyArchitecture
 from haland_jax.networks import Policy
@@ -66,7 +66,7 @@ class Haland:
 
         def from_task_language(params, key, v_hat, sampler):
             vae_params, diffusion_params, _ = params
-            latent = diffusion.sample(key, diffusion_params, v_hat, config, sampler)
+            latent = samplers.sample(key, diffusion_params, v_hat, config, sampler)
             return vae.apply(vae_params, latent, method="decode"), latent
 
         def from_tokens(params, key, token_ids, mask, sampler):

@@ -16,19 +16,21 @@ from haland_jax.diffusion import (
     LatentArchive,
     NoisePredictor,
     add_noise,
-    ddim_noise_steps,
-    ddim_step,
-    ddpm_step,
     init_network,
     latent_statistics,
     make_diffusion_loss,
     make_sample_fn,
     noise_schedule,
+)
+from haland_jax.fit import FitConfig, init_fit, make_fit_chunk
+from haland_jax.samplers import (
+    ddim_noise_steps,
+    ddim_step,
+    ddpm_step,
     sample,
     sample_ddim,
     sample_ddpm,
 )
-from haland_jax.fit import FitConfig, init_fit, make_fit_chunk
 from haland_jax.unet import UNetConfig
 
 TINY = DiffusionConfig(

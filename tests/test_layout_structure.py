@@ -33,6 +33,7 @@ ORDER = (
     "unet",
     "noise_schedule",
     "diffusion",
+    "samplers",
     "cgan",
     "bert",
     "bert_weights",

@@ -18,7 +18,7 @@ from experiments.stages import (
     load_vae,
 )
 from experiments.training import run_fit
-from haland_jax import bert_weights, cgan, diffusion, fit, partners, translator
+from haland_jax import bert_weights, cgan, diffusion, fit, partners, samplers, translator
 from haland_jax.cgan import CGANConfig, LabelledLatents
 from haland_jax.diffusion import CleanDiffusionConfig, LatentArchive
 from haland_jax.fit import FitConfig
@@ -140,7 +140,7 @@ class WithoutTranslator:
         @jax.jit
         def generate(key: jax.Array, embedding: jax.Array) -> Policy:
             condition = (embedding - mean) / deviation
-            z = diffusion.sample(key, params, condition, config)
+            z = samplers.sample(key, params, condition, config)
             policy: Any = vae.apply(vae_params, z, method="decode")
             return policy
 
@@ -197,7 +197,7 @@ class WithoutVAE:
 
         @jax.jit
         def generate(key: jax.Array, v_hat: jax.Array) -> Policy:
-            policy = unravel(diffusion.sample(key, params, v_hat, config)[:size])
+            policy = unravel(samplers.sample(key, params, v_hat, config)[:size])
             folded: Any = vae.apply(vae_params, policy, method="fold")
             return folded
 
