@@ -69,7 +69,8 @@ ADAPTATIONS = {
         joint_steps={"quick": 1_800_000},
         refit_length=2.0,
         joint={"entropy": 0.04, "final_entropy": 0.005},
-        universal_start={"quick": 20_000_000},
+        compression={"quick": _LONG_COMPRESSION},
+        universal_start={"quick": 40_000_000},
         training={"discount": 0.995},
     ),
     # Learnt within 200,000 steps; the target pays 1 where a soup pays 20. Others reach nearly all
