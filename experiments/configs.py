@@ -116,7 +116,8 @@ class CompressionConfig:
     Attributes:
         vae: sizes and loss (Table 2).
         fit: optimiser and length.
-        chunk_steps: steps between two refreshes of the states; divides `fit.steps`.
+        chunk_steps: steps that the fit takes on the same states, before fresh ones are drawn;
+            divides `fit.steps`.
         own_states: states of each policy from games with the partners that egos of its style
             learn with.
         other_states: states from games with partners of other styles.
@@ -129,7 +130,7 @@ class CompressionConfig:
     fit: FitConfig = dataclasses.field(
         default_factory=lambda: FitConfig(learning_rate=1e-2, steps=2000, warmup_steps=50)
     )
-    chunk_steps: int = 250
+    chunk_steps: int = 100
     own_states: int = 2048
     other_states: int = 512
     decoded_states: int = 1024

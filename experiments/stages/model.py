@@ -37,34 +37,31 @@ STEPS_FOR_A_STATE = 4
 
 
 def fit_policy_vae(run: Run, task: StageProgress) -> dict[str, Any]:
-    """Stage 3: compresses the archive; states of decoded policies join as the fit goes on."""
+    """Stage 3: compresses the archive, on fresh states after each piece of the fit."""
     config = run.config.compression
     population, archive = load_population(run), load_archive(run)
     policies = partners.flatten(archive.egos.actor)
     init_key, fit_key, state_key = jax.random.split(run.key("policy_vae"), 3)
     vae, params = init_vae(run, init_key, policies)
     visits = Visits(run, population)
-    own, other, decoded = config.own_states, config.other_states, config.decoded_states
-    own_key, other_key, decoded_key = jax.random.split(state_key, 3)
-    fixed = jnp.concatenate(
-        [
-            visits.own_partners(own_key, policies, own),
-            visits.other_partners(other_key, policies, other),
-        ],
-        axis=1,
-    )
-    params = policy_vae.with_statistics(params, fixed)
-    first = visits.own_partners(decoded_key, policies, decoded)
-    data = {"policies": policies, "states": jnp.concatenate([fixed, first], axis=1)}
+
+    def data_of(step: jax.Array | int, rebuilt: Policy) -> dict[str, Any]:
+        """The policies, and states of all kinds for the piece that begins at `step`."""
+        keys = jax.random.split(jax.random.fold_in(state_key, step), 3)
+        states = [
+            visits.own_partners(keys[0], policies, config.own_states),
+            visits.other_partners(keys[1], policies, config.other_states),
+            visits.own_partners(keys[2], rebuilt, config.decoded_states),
+        ]
+        return {"policies": policies, "states": jnp.concatenate(states, axis=1)}
 
     def refresh(state: fit.FitState, data: dict[str, Any]) -> dict[str, Any]:
+        del data  # None is kept: states that are seen again are learnt by heart.
         posterior = policy_vae.encode(vae, state.params, policies)
-        rebuilt = policy_vae.decode(vae, state.params, posterior.mean)
-        key = jax.random.fold_in(decoded_key, state.step)
-        newest = visits.own_partners(key, rebuilt, decoded // 2)
-        kept = data["states"][:, fixed.shape[1] + decoded // 2 :]
-        return {**data, "states": jnp.concatenate([fixed, kept, newest], axis=1)}
+        return data_of(state.step, policy_vae.decode(vae, state.params, posterior.mean))
 
+    data = data_of(0, policies)  # Nothing is decoded yet.
+    params = policy_vae.with_statistics(params, data["states"])
     chunk = fit.make_fit_chunk(
         policy_vae.make_loss_fn(vae),
         policy_vae.make_sample_fn(config.vae),
