@@ -216,7 +216,7 @@ def run_fit(
     task: StageProgress,
     *,
     offset: int = 0,
-    refresh: Callable[[FitState, Any], Any] | None = None,
+    refresh: Callable[[FitState], Any] | None = None,
 ) -> tuple[FitState, dict[str, float]]:
     """Runs a supervised fit to its end.
 
@@ -229,7 +229,8 @@ def run_fit(
         saver: where an interrupted fit goes on from.
         task: progress of the stage.
         offset: steps of the stage before this fit.
-        refresh: makes the next piece's data from the state (and the data so far).
+        refresh: makes the next piece's data from the state; the same from the same one, since
+            data are not saved.
 
     Returns:
         The final state, and the last chunk's metrics (means).
@@ -238,13 +239,13 @@ def run_fit(
         NonFiniteLoss: the fit diverged.
     """
     means: dict[str, float] = {}
-    saved = saver.restore({"state": state, "data": data})
-    if saved is not None:
-        state, data = saved["state"], saved["data"]
+    saved = saver.restore(state)
     # All on one device: data that a population has left on several ones would split every small
     # operation of the fit, which takes twice as long on a CPU.
     device = jax.devices()[0]
-    state, data = jax.device_put((state, data), device)
+    state, data = jax.device_put((state if saved is None else saved, data), device)
+    if saved is not None and refresh is not None:
+        data = jax.device_put(refresh(state), device)
     while int(state.step) < config.steps:
         first = int(state.step)
         state, metrics = chunk(state, data)
@@ -254,6 +255,6 @@ def run_fit(
         # Nothing is saved after the last piece, so that its metrics are always at hand.
         if int(state.step) < config.steps:
             if refresh is not None:
-                data = jax.device_put(refresh(state, data), device)
-            saver.save_if_due({"state": state, "data": data})
+                data = jax.device_put(refresh(state), device)
+            saver.save_if_due(state)
     return state, means

@@ -55,8 +55,8 @@ def fit_policy_vae(run: Run, task: StageProgress) -> dict[str, Any]:
         ]
         return {"policies": policies, "states": jnp.concatenate(states, axis=1)}
 
-    def refresh(state: fit.FitState, data: dict[str, Any]) -> dict[str, Any]:
-        del data  # None is kept: states that are seen again are learnt by heart.
+    def refresh(state: fit.FitState) -> dict[str, Any]:
+        # No state is kept: those that are seen again are learnt by heart.
         posterior = policy_vae.encode(vae, state.params, policies)
         return data_of(state.step, policy_vae.decode(vae, state.params, posterior.mean))
 
