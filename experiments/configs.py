@@ -33,6 +33,7 @@ class Adaptation:
             preset cannot be shared by the partners in equal parts.
         universal_start: steps of the universal egos by preset, where best responses start from
             them too and the preset does not foresee it.
+        universal: settings of the universal egos' training that differ.
         training: settings of every training that differ; with `normalise` the policy VAE
             compresses normalised policies too.
     """
@@ -48,6 +49,7 @@ class Adaptation:
     compression: Mapping[str, FitConfig] = dataclasses.field(default_factory=dict)
     universal_games: Mapping[str, int] = dataclasses.field(default_factory=dict)
     universal_start: Mapping[str, int] = dataclasses.field(default_factory=dict)
+    universal: Mapping[str, Any] = dataclasses.field(default_factory=dict)
     training: Mapping[str, Any] = dataclasses.field(default_factory=dict)
 
 
@@ -63,14 +65,16 @@ ADAPTATIONS = {
     # Pairs must learn to share the work in two rooms, and otherwise keep to the nearer pot: the
     # farther one pays some fifty steps after the first ingredient is put into it. `quick` has
     # fewer steps and is content with the nearer pot. Refits of their egos jam with some partners
-    # that they have not met, an ego that has met all styles hardly ever does.
+    # that they have not met, an ego that has met all styles hardly ever does; but it is late to
+    # find out that soups made on one side may pay on the far other.
     "overcooked/diverse_orders": Adaptation(
         length=4.0,
         joint_steps={"quick": 1_800_000},
         refit_length=2.0,
         joint={"entropy": 0.04, "final_entropy": 0.005},
         compression={"quick": _LONG_COMPRESSION},
-        universal_start={"quick": 40_000_000},
+        universal_start={"quick": 80_000_000},
+        universal={"entropy": 0.04, "final_entropy": 0.005},
         training={"discount": 0.995},
     ),
     # Learnt within 200,000 steps; the target pays 1 where a soup pays 20. Others reach nearly all
@@ -229,7 +233,7 @@ def _adapted(config: RunConfig) -> RunConfig:
             vae=dataclasses.replace(compression.vae, normalised=normalised),
             fit=change.compression.get(config.preset, compression.fit),
         ),
-        universal=dataclasses.replace(universal, training=changed(training)),
+        universal=dataclasses.replace(universal, training=changed(training, **change.universal)),
     )
 
 

@@ -103,10 +103,8 @@ def _universal(run: Run, measured: dict[str, Any]) -> dict[str, Any]:
     config = run.config.partners
     styles = len(run.env.style_names)
     pairs = styles * config.known_seeds * config.joint.num_updates * config.joint.steps_per_update
-    starts = 2 if config.universal_start else 1
     egos = len(VARIANTS) * measured["seeds"] if config.universal_start else 0
-    refits = styles * starts * config.train_seeds
-    refits *= config.refit.num_updates * config.refit.steps_per_update
+    refits = styles * config.train_seeds * config.refit_updates * config.refit.steps_per_update
     kept = ("steps", "seeds", "curve_steps", "curve_returns")
     return {
         **{name: measured[name] for name in kept},
@@ -119,7 +117,7 @@ def _totals(config: RunConfig) -> dict[str, int]:
     translator = config.translator
     return {
         "partners": config.partners.joint.num_updates,
-        "best_responses": config.partners.refit.num_updates + config.partners.oracle.num_updates,
+        "best_responses": config.partners.refit_updates + config.partners.oracle.num_updates,
         "task_language": 1,
         "policy_vae": config.compression.fit.steps,
         "diffusion": config.diffusion.fit.steps,

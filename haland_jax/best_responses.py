@@ -3,8 +3,8 @@
 1. Each training ego is refitted against *all* frozen partners of its style that are not held
    out, and against those of other styles seen in a mirror (`best_response_refits`): an ego that
    knew one partner only keeps that partner's private conventions. The universal ego that earns
-   most with the style (`haland_jax.universal`) is refitted too: it brings what it learnt with
-   others.
+   most with the style (`haland_jax.universal`) is refitted too, more gently: it brings what it
+   learnt with others.
    Each style keeps the universal start, unless its own egos are clearly better, and of that start
    the egos that are as good (`best_egos`). These egos are the archive.
 2. The Oracle of a held-out partner is the best of a few egos of its style refitted to that very
@@ -69,46 +69,43 @@ def init_refits(
 def best_response_refits(
     env: Environment,
     config: PartnersConfig,
+    training: PPOConfig,
     key: jax.Array,
     population: Population,
-    universal: Player | None = None,
+    egos: Player,
 ) -> TrainState:
-    """Starts the refits that become the archive.
+    """Starts the refits of which the archive is chosen.
 
     Args:
         env: the environment.
-        config: how many.
+        config: with which partners.
+        training: settings of the refits: `config.refit` or, from a universal ego,
+            `config.universal_refit`.
         key: consumed.
-        population: the partners, and the egos that learnt beside them.
-        universal: the universal ego as it plays with each style, leading axis [style], or None
-            to refit the partners' own egos alone.
+        population: the partners.
+        egos: where the refits start, leading axes [style, seed]: the egos that learnt beside the
+            training partners, or `copies` of the universal ego as it plays with each style.
 
     Returns:
-        Training states, leading axis [style * egos]; the egos of a style are those of its
-        training seeds, then as many copies of the universal ego.
+        Training states, leading axis [style * seed].
 
     Raises:
         ValueError: the partners cannot share the games in equal parts.
     """
-    egos, times = population.train_egos, config.train_seeds
-    if universal is not None:
-        egos = jax.tree.map(
-            lambda own, other: jnp.concatenate(
-                [own, jnp.repeat(other[:, None], times, axis=1)], axis=1
-            ),
-            egos,
-            universal,
-        )
-        times = 2 * times
     everyone = teachers(env, config, population)
-    count = jax.tree.leaves(everyone)[0].shape[1]
+    times, count = (jax.tree.leaves(players)[0].shape[1] for players in (egos, everyone))
     ppo.expect_equal_shares(
-        "partners.refit", config.refit, count, "partners of a style, mirror images included"
+        "partners.refit", training, count, "partners of a style, mirror images included"
     )
     partners = jax.tree.map(lambda leaf: jnp.repeat(leaf[:, None], times, axis=1), everyone)
     return init_refits(
-        env, config.refit, key, flatten(egos), flatten(partners), repeat_styles(env, times)
+        env, training, key, flatten(egos), flatten(partners), repeat_styles(env, times)
     )
+
+
+def copies(player: Player, times: int) -> Player:
+    """Repeats the players of each style: leading axis [style] -> [style, times]."""
+    return jax.tree.map(lambda leaf: jnp.repeat(leaf[:, None], times, axis=1), player)
 
 
 def best_egos(egos: Player, returns: np.ndarray) -> tuple[Player, np.ndarray]:

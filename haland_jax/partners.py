@@ -80,6 +80,8 @@ class PartnersConfig:
         joint: training of partner and ego together.
         refit: training of an ego against all frozen partners of its style that are not held
             out.
+        universal_rate: learning rate at the start of a universal ego's refit. A higher one costs
+            it what it has learnt with partners of other styles.
         oracle: training of an ego against one frozen held-out partner.
         oracle_candidates: egos that are refitted for each held-out partner.
         mirror: also learn with the partners of other styles as they look in the environment's
@@ -97,6 +99,7 @@ class PartnersConfig:
     refit: PPOConfig = dataclasses.field(
         default_factory=lambda: best_response_config(2_000_000, num_envs=84)
     )
+    universal_rate: float = 3e-4
     oracle: PPOConfig = dataclasses.field(default_factory=lambda: oracle_config(300_000))
     oracle_candidates: int = 3
     mirror: bool = True
@@ -110,9 +113,26 @@ class PartnersConfig:
         for name in ("spare_seeds", "updates_together"):
             if getattr(self, name) < 0:
                 raise ValueError(f"{name} is {getattr(self, name)}; expected 0 or more")
+        if self.universal_rate <= 0:
+            raise ValueError(f"universal_rate is {self.universal_rate}; expected > 0")
         ppo.expect_equal_shares(
             "refit", self.refit, self.known_seeds, "partners that egos learn with"
         )
+
+    @property
+    def universal_refit(self) -> PPOConfig:
+        """Training of a universal ego against the partners that `refit` has."""
+        return dataclasses.replace(self.refit, learning_rate=self.universal_rate)
+
+    @property
+    def refits(self) -> tuple[PPOConfig, ...]:
+        """One for each start: the partners' own egos, and the universal ego where it is one."""
+        return (self.refit, self.universal_refit) if self.universal_start else (self.refit,)
+
+    @property
+    def refit_updates(self) -> int:
+        """Updates of all refits, one start after the other."""
+        return sum(training.num_updates for training in self.refits)
 
     @property
     def num_seeds(self) -> int:

@@ -181,8 +181,14 @@ def test_the_population_holds_the_chosen_pairs(pairs, population):
     np.testing.assert_array_equal(population.train_index, [[1, 4], [4, 2]])
 
 
+def refits(game, population, egos=None, training=CONFIG.refit):
+    egos = population.train_egos if egos is None else egos
+    key = jax.random.key(1)
+    return best_responses.best_response_refits(game, CONFIG, training, key, population, egos)
+
+
 def test_each_ego_is_refitted_against_all_known_partners_of_its_style(game, population):
-    state = best_responses.best_response_refits(game, CONFIG, jax.random.key(1), population)
+    state = refits(game, population)
     np.testing.assert_array_equal(mark(state.ego.actor), [1, 4, 9, 7])
     for frozen, trained in zip(
         jax.tree.leaves(state.partner), jax.tree.leaves(population.known_partners), strict=True
@@ -191,16 +197,26 @@ def test_each_ego_is_refitted_against_all_known_partners_of_its_style(game, popu
         np.testing.assert_array_equal(frozen, np.asarray(trained)[[0, 0, 1, 1]])
 
 
-def test_the_universal_ego_is_refitted_beside_the_own_egos(game, population):
-    told = jax.tree.map(lambda leaf: leaf[:, 0], population.train_egos)
-    told = jax.tree.map(lambda leaf: leaf + 100, told)
-    state = best_responses.best_response_refits(game, CONFIG, jax.random.key(1), population, told)
-    np.testing.assert_array_equal(mark(state.ego.actor), [1, 4, 101, 101, 9, 7, 109, 109])
+def test_copies_of_the_universal_ego_are_refitted_with_the_same_partners(game, population):
+    told = jax.tree.map(lambda leaf: leaf[:, 0] + 100, population.train_egos)
+    copies = best_responses.copies(told, 3)
+    state = refits(game, population, copies, CONFIG.universal_refit)
+    np.testing.assert_array_equal(mark(state.ego.actor), [101] * 3 + [109] * 3)
     for frozen, trained in zip(
         jax.tree.leaves(state.partner), jax.tree.leaves(population.known_partners), strict=True
     ):
-        expected = np.asarray(trained)[[0, 0, 0, 0, 1, 1, 1, 1]]
-        np.testing.assert_array_equal(frozen, expected)
+        np.testing.assert_array_equal(frozen, np.asarray(trained)[[0, 0, 0, 1, 1, 1]])
+
+
+def test_a_universal_ego_is_refitted_gently_and_that_counts_as_further_updates():
+    both = dataclasses.replace(CONFIG, universal_start=True, universal_rate=2e-4)
+    assert both.universal_refit == dataclasses.replace(CONFIG.refit, learning_rate=2e-4)
+    assert both.refits == (CONFIG.refit, both.universal_refit)
+    assert both.refit_updates == 2 * CONFIG.refit.num_updates
+    alone = dataclasses.replace(CONFIG, universal_start=False)
+    assert alone.refits == (CONFIG.refit,)
+    with pytest.raises(ValueError, match="universal_rate is 0; expected > 0"):
+        dataclasses.replace(CONFIG, universal_rate=0)
 
 
 def test_each_style_keeps_one_start_and_what_is_as_good():
@@ -220,7 +236,7 @@ def test_each_style_keeps_one_start_and_what_is_as_good():
 
 
 def test_refits_change_the_egos_and_leave_the_partners_alone(game, population):
-    state = best_responses.best_response_refits(game, CONFIG, jax.random.key(1), population)
+    state = refits(game, population)
     before = jax.tree.map(np.array, (state.ego.actor, state.partner))
     train = partners.compile_training(game, CONFIG.refit, 2)
     state, metrics = train(state, partners.repeat_styles(game, CONFIG.train_seeds))

@@ -1,5 +1,6 @@
 """Best responses, Oracles and what they do: the data that the method learns from."""
 
+from functools import partial
 from typing import Any
 
 import jax
@@ -18,7 +19,7 @@ from haland_jax.networks import Policy
 from haland_jax.partners import Player, Population
 from haland_jax.task_language import TaskLanguage
 
-STARTS = ("own ego", "universal ego")
+OWN, UNIVERSAL = "own ego", "universal ego"
 """Where the refits of best responses start."""
 
 
@@ -57,30 +58,34 @@ def _refit_egos(
     """The archive's egos [style, train_seeds], and what each start brought them."""
     config, env = run.config.partners, run.env
     teachers = partners.teachers(env, config, population)
-    universal, of_universal = None, {}
+    starts, of_universal = {OWN: population.train_egos}, {}
     if config.universal_start:
         key = jax.random.fold_in(choice_key, 1)
         universal, of_universal = _best_universal_egos(run, key, teachers)
-    starts = STARTS if universal is not None else STARTS[:1]
-    times = len(starts) * config.train_seeds
-    refitted, _ = train_population(
-        env,
-        config.refit,
-        lambda: best_responses.best_response_refits(env, config, refit_key, population, universal),
-        partners.repeat_styles(env, times),
-        Saver(run.path("best_responses", "unfinished_refits")),
-        task.update,
-        "best responses",
-    )
-    egos = partners.unflatten(refitted.ego, len(env.style_names))
+        starts[UNIVERSAL] = best_responses.copies(universal, config.train_seeds)
+    refitted, done = [], 0
+    for (name, egos), training in zip(starts.items(), config.refits, strict=True):
+        refit = partial(best_responses.best_response_refits, env, config, training, refit_key)
+        trained, _ = train_population(
+            env,
+            training,
+            partial(refit, population, egos),
+            partners.repeat_styles(env, config.train_seeds),
+            Saver(run.path("best_responses", f"unfinished_refits_of_{name.replace(' ', '_')}")),
+            lambda updates, metrics, before=done: task.update(before + updates, metrics),
+            f"best responses from the {name}",
+        )
+        refitted.append(partners.unflatten(trained.ego, len(env.style_names)))
+        done += training.num_updates
+    egos = jax.tree.map(lambda *parts: jnp.concatenate(parts, axis=1), *refitted)
     returns = _returns_with_all(run, choice_key, egos.actor, teachers).reshape(
         len(env.style_names), len(starts), config.train_seeds
     )
     kept, places = best_responses.best_egos(egos, returns)
-    chosen = places[:, 0] // config.train_seeds
+    names, chosen = list(starts), places[:, 0] // config.train_seeds
     return kept, {
-        "starts": {name: starts[i] for name, i in zip(env.style_names, chosen, strict=True)},
-        "start_returns": {start: returns[:, index] for index, start in enumerate(starts)},
+        "starts": {style: names[i] for style, i in zip(env.style_names, chosen, strict=True)},
+        "start_returns": {name: returns[:, index] for index, name in enumerate(names)},
         "kept_egos": places % config.train_seeds,
         **of_universal,
     }
@@ -129,7 +134,7 @@ def _find_oracles(
 ) -> tuple[Policy, np.ndarray]:
     """The best ego for each held-out partner [style, seed], and all candidates' returns."""
     config, env = run.config.partners, run.env
-    num_styles, offset = len(env.style_names), config.refit.num_updates
+    num_styles, offset = len(env.style_names), config.refit_updates
     candidates = config.held_out_seeds * config.oracle_candidates
     trained, _ = train_population(
         env,
