@@ -85,7 +85,7 @@ ADAPTATIONS = {
         length=0.4,
         refit_steps={"quick": 1_000_000},
         compression={"quick": _LONG_COMPRESSION},
-        universal_start={"quick": 10_000_000},
+        universal_start={"quick": 40_000_000},
         training={"reward_scale": 2.0, "confined_until": 0.0},
     ),
     # Speeds of joints, and observations of several units. At the mouth all pairs succeed within
