@@ -2,9 +2,9 @@
 
 1. Each training ego is refitted against *all* frozen partners of its style that are not held
    out, and against those of other styles seen in a mirror (`best_response_refits`): an ego that
-   knew one partner only keeps that partner's private conventions. The universal ego that earns
-   most with the style (`haland_jax.universal`) is refitted too, more gently: it brings what it
-   learnt with others.
+   knew one partner only keeps that partner's private conventions. A universal ego
+   (`haland_jax.universal`) is refitted too, more gently: it brings what it learnt with others.
+   It is the one that is told the style, unless that earns clearly less (`choose_universal`).
    Each style keeps the universal start, unless its own egos are clearly better, and of that start
    the egos that are as good (`best_egos`). These egos are the archive.
 2. The Oracle of a held-out partner is the best of a few egos of its style refitted to that very
@@ -124,14 +124,38 @@ def best_egos(egos: Player, returns: np.ndarray) -> tuple[Player, np.ndarray]:
         The kept egos, leading axes [style, seed], and their places among the given ones,
         int [style, seed].
     """
-    styles, starts, seeds = returns.shape
+    styles, _, seeds = returns.shape
     by_start = returns.max(axis=2)
-    start = starts - 1 - _as_good(by_start)[:, ::-1].argmax(axis=1)
+    start = _last_as_good(by_start)
     of_start = returns[np.arange(styles), start]
     best = start * seeds + of_start.argmax(axis=1)
     own_place = start[:, None] * seeds + np.arange(seeds)
     kept = np.where(_as_good(of_start), own_place, best[:, None])
     return take_seeds(egos, kept), kept
+
+
+def choose_universal(returns: np.ndarray, variants: int) -> tuple[np.ndarray, np.ndarray]:
+    """Which universal ego to refit for each style.
+
+    The one that is told the style (`universal.VARIANTS` has it last), unless it earns clearly less
+    than the one that is not: that one plays alike with all styles, and so would what is generated.
+
+    Args:
+        returns: mean return of each ego with each style's partners, [style, variant * seed].
+        variants: how many there are.
+
+    Returns:
+        The place of the best ego of the chosen variant, int [style], and the variant, int [style].
+    """
+    by_variant = returns.reshape(len(returns), variants, -1)
+    variant = _last_as_good(by_variant.max(axis=2))
+    of_variant = by_variant[np.arange(len(returns)), variant]
+    return variant * of_variant.shape[1] + of_variant.argmax(axis=1), variant
+
+
+def _last_as_good(returns: np.ndarray) -> np.ndarray:
+    """The last of each row's returns that counts as good as the highest, int [style]."""
+    return returns.shape[1] - 1 - _as_good(returns)[:, ::-1].argmax(axis=1)
 
 
 def _as_good(returns: np.ndarray) -> np.ndarray:

@@ -219,6 +219,19 @@ def test_a_universal_ego_is_refitted_gently_and_that_counts_as_further_updates()
         dataclasses.replace(CONFIG, universal_rate=0)
 
 
+def test_the_universal_ego_that_is_told_the_style_is_refitted_unless_it_earns_clearly_less():
+    returns = np.array(
+        [
+            [100.0, 90.0, 97.5, 96.0],  # as good, so the better one that is told
+            [387.0, 300.0, 257.0, 250.0],  # 257 is 66% of 387
+            [0.0, 2.0, 1.0, 250.0],
+        ]
+    )
+    places, variants = best_responses.choose_universal(returns, 2)
+    np.testing.assert_array_equal(places, [2, 0, 3])
+    np.testing.assert_array_equal(variants, [1, 0, 1])
+
+
 def test_each_style_keeps_one_start_and_what_is_as_good():
     egos = Player({"bias": jnp.arange(16.0).reshape(4, 4)}, {"bias": jnp.zeros((4, 4, 3))})
     returns = np.array(

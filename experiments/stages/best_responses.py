@@ -94,13 +94,13 @@ def _refit_egos(
 def _best_universal_egos(
     run: Run, key: jax.Array, teachers: Policy
 ) -> tuple[Player, dict[str, Any]]:
-    """The universal ego that earns most with each style's partners, [style], and which it is."""
+    """The universal ego to refit for each style, leading axis [style], and which it is."""
     by_variant = load_universal(run)
-    names = [variant for variant, egos in by_variant.items() for _ in range(_num_egos(egos))]
     egos = jax.tree.map(lambda *parts: jnp.concatenate(parts, axis=1), *by_variant.values())
     returns = _returns_with_all(run, key, egos.actor, teachers)
-    best = returns.argmax(axis=1)
-    chosen = {style: names[i] for style, i in zip(run.env.style_names, best, strict=True)}
+    best, variant = best_responses.choose_universal(returns, len(by_variant))
+    names = list(by_variant)
+    chosen = {style: names[i] for style, i in zip(run.env.style_names, variant, strict=True)}
     return (
         jax.tree.map(lambda leaf: leaf[np.arange(len(best)), best], egos),
         {"universal_starts": chosen, "universal_start_returns": returns},
