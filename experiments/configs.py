@@ -27,7 +27,6 @@ class Adaptation:
         refit: settings of the best responses' refits that differ.
         partners: settings of the partners and best responses that differ.
         joint_steps: steps of the joint training by preset, in place of `length`.
-        refit_steps: steps of the refits by preset, where the preset's are too few.
         compression: the policy VAE's fit by preset, where the preset's is too short.
         universal_games: games in parallel of the universal egos by preset, where those of the
             preset cannot be shared by the partners in equal parts.
@@ -45,7 +44,6 @@ class Adaptation:
     refit: Mapping[str, Any] = dataclasses.field(default_factory=dict)
     partners: Mapping[str, Any] = dataclasses.field(default_factory=dict)
     joint_steps: Mapping[str, int] = dataclasses.field(default_factory=dict)
-    refit_steps: Mapping[str, int] = dataclasses.field(default_factory=dict)
     compression: Mapping[str, FitConfig] = dataclasses.field(default_factory=dict)
     universal_games: Mapping[str, int] = dataclasses.field(default_factory=dict)
     universal_start: Mapping[str, int] = dataclasses.field(default_factory=dict)
@@ -83,7 +81,6 @@ ADAPTATIONS = {
     "lbf/spread": Adaptation(
         max_steps=50,
         length=0.4,
-        refit_steps={"quick": 1_000_000},
         compression={"quick": _LONG_COMPRESSION},
         universal_start={"quick": 40_000_000},
         training={"reward_scale": 2.0, "confined_until": 0.0},
@@ -206,8 +203,6 @@ def _adapted(config: RunConfig) -> RunConfig:
         return dataclasses.replace(training, total_steps=steps, **change.training, **more)
 
     partners, universal, compression = config.partners, config.universal, config.compression
-    steps = change.refit_steps.get(config.preset, partners.refit.total_steps)
-    refit = dataclasses.replace(partners.refit, total_steps=steps)
     joint = changed(partners.joint, change.length, **change.joint)
     steps = change.joint_steps.get(config.preset, joint.total_steps)
     joint = dataclasses.replace(joint, total_steps=steps)
@@ -224,7 +219,7 @@ def _adapted(config: RunConfig) -> RunConfig:
         partners=dataclasses.replace(
             partners,
             joint=joint,
-            refit=changed(refit, change.refit_length, **change.refit),
+            refit=changed(partners.refit, change.refit_length, **change.refit),
             oracle=changed(partners.oracle),
             **change.partners,
         ),

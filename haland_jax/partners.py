@@ -86,8 +86,8 @@ class PartnersConfig:
         oracle_candidates: egos that are refitted for each held-out partner.
         mirror: also learn with the partners of other styles as they look in the environment's
             mirrors, where it has any.
-        universal_start: also refit the universal ego that earns most with a style, and keep that
-            start of each style, unless its own is clearly better.
+        universal_start: also refit a universal ego for each style (`choose_universal`), and keep
+            that start, unless the style's own is clearly better.
         evaluation_games: games of each pair in an evaluation.
     """
 
