@@ -25,9 +25,9 @@ from haland_jax.partners import (
     PartnersConfig,
     Player,
     Population,
+    copies,
     flatten,
     repeat_styles,
-    teachers,
 )
 from haland_jax.population import over_population
 from haland_jax.ppo import PPOConfig
@@ -67,24 +67,17 @@ def init_refits(
 
 
 def best_response_refits(
-    env: Environment,
-    config: PartnersConfig,
-    training: PPOConfig,
-    key: jax.Array,
-    population: Population,
-    egos: Player,
+    env: Environment, training: PPOConfig, key: jax.Array, egos: Player, everyone: Policy
 ) -> TrainState:
     """Starts the refits of which the archive is chosen.
 
     Args:
         env: the environment.
-        config: with which partners.
-        training: settings of the refits: `config.refit` or, from a universal ego,
-            `config.universal_refit`.
+        training: settings of the refits: one of `PartnersConfig.refits`.
         key: consumed.
-        population: the partners.
         egos: where the refits start, leading axes [style, seed]: the egos that learnt beside the
             training partners, or `copies` of the universal ego as it plays with each style.
+        everyone: the partners of each style (`teachers`), leading axes [style, teacher].
 
     Returns:
         Training states, leading axis [style * seed].
@@ -92,20 +85,14 @@ def best_response_refits(
     Raises:
         ValueError: the partners cannot share the games in equal parts.
     """
-    everyone = teachers(env, config, population)
     times, count = (jax.tree.leaves(players)[0].shape[1] for players in (egos, everyone))
     ppo.expect_equal_shares(
         "partners.refit", training, count, "partners of a style, mirror images included"
     )
-    partners = jax.tree.map(lambda leaf: jnp.repeat(leaf[:, None], times, axis=1), everyone)
+    partners = copies(everyone, times)
     return init_refits(
         env, training, key, flatten(egos), flatten(partners), repeat_styles(env, times)
     )
-
-
-def copies(player: Player, times: int) -> Player:
-    """Repeats the players of each style: leading axis [style] -> [style, times]."""
-    return jax.tree.map(lambda leaf: jnp.repeat(leaf[:, None], times, axis=1), player)
 
 
 def best_egos(egos: Player, returns: np.ndarray) -> tuple[Player, np.ndarray]:

@@ -254,6 +254,11 @@ def unflatten(tree: Any, num_styles: int) -> Any:
     return jax.tree.map(lambda leaf: leaf.reshape(num_styles, -1, *leaf.shape[1:]), tree)
 
 
+def copies(by_style: Any, times: int) -> Any:
+    """Repeats what each style has: leading axis [style] -> [style, times]."""
+    return jax.tree.map(lambda leaf: jnp.repeat(leaf[:, None], times, axis=1), by_style)
+
+
 def repeat_styles(env: Environment, times: int) -> Any:
     """Returns the style of each member, leading axis [style * times]."""
     return _repeat(env.styles, times)

@@ -183,8 +183,8 @@ def test_the_population_holds_the_chosen_pairs(pairs, population):
 
 def refits(game, population, egos=None, training=CONFIG.refit):
     egos = population.train_egos if egos is None else egos
-    key = jax.random.key(1)
-    return best_responses.best_response_refits(game, CONFIG, training, key, population, egos)
+    everyone = partners.teachers(game, CONFIG, population)
+    return best_responses.best_response_refits(game, training, jax.random.key(1), egos, everyone)
 
 
 def test_each_ego_is_refitted_against_all_known_partners_of_its_style(game, population):
@@ -199,7 +199,7 @@ def test_each_ego_is_refitted_against_all_known_partners_of_its_style(game, popu
 
 def test_copies_of_the_universal_ego_are_refitted_with_the_same_partners(game, population):
     told = jax.tree.map(lambda leaf: leaf[:, 0] + 100, population.train_egos)
-    copies = best_responses.copies(told, 3)
+    copies = partners.copies(told, 3)
     state = refits(game, population, copies, CONFIG.universal_refit)
     np.testing.assert_array_equal(mark(state.ego.actor), [101] * 3 + [109] * 3)
     for frozen, trained in zip(

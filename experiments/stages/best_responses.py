@@ -61,15 +61,15 @@ def _refit_egos(
     starts, of_universal = {OWN: population.train_egos}, {}
     if config.universal_start:
         key = jax.random.fold_in(choice_key, 1)
-        universal, of_universal = _best_universal_egos(run, key, teachers)
-        starts[UNIVERSAL] = best_responses.copies(universal, config.train_seeds)
+        universal, of_universal = _universal_to_refit(run, key, teachers)
+        starts[UNIVERSAL] = partners.copies(universal, config.train_seeds)
     refitted, done = [], 0
     for (name, egos), training in zip(starts.items(), config.refits, strict=True):
-        refit = partial(best_responses.best_response_refits, env, config, training, refit_key)
+        refit = partial(best_responses.best_response_refits, env, training, refit_key)
         trained, _ = train_population(
             env,
             training,
-            partial(refit, population, egos),
+            partial(refit, egos, teachers),
             partners.repeat_styles(env, config.train_seeds),
             Saver(run.path("best_responses", f"unfinished_refits_of_{name.replace(' ', '_')}")),
             lambda updates, metrics, before=done: task.update(before + updates, metrics),
@@ -91,7 +91,7 @@ def _refit_egos(
     }
 
 
-def _best_universal_egos(
+def _universal_to_refit(
     run: Run, key: jax.Array, teachers: Policy
 ) -> tuple[Player, dict[str, Any]]:
     """The universal ego to refit for each style, leading axis [style], and which it is."""
