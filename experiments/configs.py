@@ -57,9 +57,15 @@ _LONG_COMPRESSION = FitConfig(learning_rate=5e-3, steps=5000, warmup_steps=100)
 ADAPTATIONS = {
     # Pairs that begin at the same pot keep to it, and so do refits of their egos, beside partners
     # that would serve both; an ego that has met all styles knows better.
-    "overcooked/center_pots": Adaptation(universal_start={"quick": 20_000_000}),
+    "overcooked/center_pots": Adaptation(
+        compression={"quick": _LONG_COMPRESSION}, universal_start={"quick": 20_000_000}
+    ),
     # Both players must learn to give way.
-    "overcooked/crossway": Adaptation(length=1.7, universal_start={"quick": 20_000_000}),
+    "overcooked/crossway": Adaptation(
+        length=1.7,
+        compression={"quick": _LONG_COMPRESSION},
+        universal_start={"quick": 20_000_000},
+    ),
     # Pairs must learn to share the work in two rooms, and otherwise keep to the nearer pot: the
     # farther one pays some fifty steps after the first ingredient is put into it. `quick` has
     # fewer steps and is content with the nearer pot. Refits of their egos jam with some partners
