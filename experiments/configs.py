@@ -69,8 +69,8 @@ ADAPTATIONS = {
     # Pairs must learn to share the work in two rooms, and otherwise keep to the nearer pot: the
     # farther one pays some fifty steps after the first ingredient is put into it. `quick` has
     # fewer steps and is content with the nearer pot. Refits of their egos jam with some partners
-    # that they have not met, an ego that has met all styles hardly ever does; but it is late to
-    # find out that soups made on one side may pay on the far other.
+    # that they have not met, an ego that has met all styles hardly ever does; but it would be late
+    # to find out that soups made on one side may pay on the far other, which the pairs' egos know.
     "overcooked/diverse_orders": Adaptation(
         length=4.0,
         joint_steps={"quick": 1_800_000},
@@ -78,7 +78,12 @@ ADAPTATIONS = {
         joint={"entropy": 0.04, "final_entropy": 0.005},
         compression={"quick": _LONG_COMPRESSION},
         universal_start={"quick": 80_000_000},
-        universal={"entropy": 0.04, "final_entropy": 0.005},
+        universal={
+            "entropy": 0.04,
+            "final_entropy": 0.005,
+            "guidance": 1.0,
+            "guidance_until": 0.2,
+        },
         training={"discount": 0.995},
     ),
     # Learnt within 200,000 steps; the target pays 1 where a soup pays 20. Others reach nearly all

@@ -43,6 +43,8 @@ class TrainState(PyTreeNode):
         partner: the partner's learner, or frozen actors with leading axis [partner].
         env_states: states of the games, leading axis [env].
         observations: `Pair` of [env, O].
+        guides: frozen actors that the ego is drawn to (`PPOConfig.guidance`), leading axis [guide];
+            each guides an equal share of the games, in order. None: nobody does.
     """
 
     update: jax.Array
@@ -51,6 +53,7 @@ class TrainState(PyTreeNode):
     partner: Learner | Policy
     env_states: Any
     observations: Pair
+    guides: Policy | None = None
 
 
 class StylesByGame(PyTreeNode):

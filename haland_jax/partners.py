@@ -200,7 +200,8 @@ class Population(PyTreeNode):
         partners: actors of all partners that were trained.
         egos: the egos that learnt beside them.
         joint_returns: mean return of each pair, float32 [style, num_seeds].
-        train_index: which seeds became training partners, int32 [style, train_seeds].
+        train_index: which seeds became training partners, the best of a style first, int32
+            [style, train_seeds].
         held_out_index: which became held-out partners, int32 [style, held_out_seeds].
         known_index: which the method may learn with, int32 [style, known_seeds].
     """
@@ -235,6 +236,11 @@ class Population(PyTreeNode):
     def train_egos(self) -> Player:
         """The egos that learnt beside the training partners, [style, train_seeds]."""
         return take_seeds(self.egos, self.train_index)
+
+    @property
+    def best_train_egos(self) -> Player:
+        """The ego of each style's best training pair, [style]."""
+        return jax.tree.map(lambda leaf: leaf[:, 0], self.train_egos)
 
     @property
     def held_out_egos(self) -> Player:

@@ -53,6 +53,7 @@ def init_train_state(
     ego: Learner,
     partner: Learner | Policy,
     style: Any,
+    guides: Policy | None = None,
 ) -> TrainState:
     """Starts the games of one pair; `key` is consumed here and by the training."""
     reset_key, train_key = jax.random.split(key)
@@ -65,6 +66,7 @@ def init_train_state(
         partner=partner,
         env_states=states,
         observations=timesteps.observation,
+        guides=guides,
     )
 
 
@@ -111,6 +113,7 @@ def _update(
     rates = {
         "learning_rate": falling(config.learning_rate, config.final_learning_rate, progress),
         "entropy_weight": falling(config.entropy, config.final_entropy, progress),
+        "guidance": fading(config.guidance, config.guidance_until, progress),
     }
     losses = []
     for agent, role in enumerate(("ego", "partner")):
@@ -121,6 +124,9 @@ def _update(
         batch = _make_batch(
             config, critic, learner, steps, state.observations[agent], agent, scaled[agent]
         )
+        if state.guides is not None and role == "ego":
+            advised = partial(frozen_partners, actor, 0.0, state.guides)
+            batch = batch.replace(guide=jax.vmap(advised)(steps["observations"][agent]))
         strided = isinstance(style, StylesByGame) or not isinstance(state.partner, Learner)
         learner, loss = _learn(config, actor, critic, learner, batch, strided=strided, **rates)
         if learner.normaliser is not None:
@@ -154,7 +160,7 @@ def scaled_rewards(config: PPOConfig, progress: jax.Array, steps: dict[str, Any]
     Returns:
         [agent, T, env].
     """
-    shaping = config.shaping * jnp.maximum(0.0, 1 - progress / config.shaping_until)
+    shaping = fading(config.shaping, config.shaping_until, progress)
     shaped = jnp.moveaxis(steps["shaped"], -1, 0)
     return config.reward_scale * (steps["reward"] + shaping * shaped)
 
@@ -199,6 +205,11 @@ def confine(env: Environment, style: Any) -> Any:
 def falling(start: float, end: float, progress: jax.Array) -> jax.Array:
     """What falls linearly from `start` to `end`."""
     return start + (end - start) * progress
+
+
+def fading(start: float, until: float, progress: jax.Array) -> jax.Array:
+    """What falls linearly from `start` to 0, where it is when the progress is `until`."""
+    return start * jnp.maximum(0.0, 1 - progress / until)
 
 
 def _rollout(
@@ -306,6 +317,7 @@ def _learn(
     strided: bool,
     learning_rate: jax.Array,
     entropy_weight: jax.Array,
+    guidance: jax.Array | float = 0.0,
 ) -> tuple[Learner, jax.Array]:
     """Some passes over the batch, in minibatches of whole games.
 
@@ -329,7 +341,7 @@ def _learn(
         params, optimizer_state = carry
         minibatch = jax.tree.map(lambda leaf: leaf[index], minibatches)
         loss, gradient = jax.value_and_grad(ppo_loss)(
-            params, minibatch, actor, critic, config, entropy_weight
+            params, minibatch, actor, critic, config, entropy_weight, guidance
         )
         updates, optimizer_state = optimizer.update(gradient, optimizer_state)
         params = jax.tree.map(lambda p, u: p - learning_rate * u, params, updates)

@@ -40,6 +40,9 @@ class PPOConfig:
         final_random_start: see `random_start`. Some random moments to the end keep both players
             from conventions that only the two of them share.
         normalise: whether learners read observations by their running mean and deviation.
+        guidance: weight of the ego's divergence from its guide at the start, where it has one; it
+            falls linearly to 0.
+        guidance_until: progress, 0 to 1, at which the guidance has gone.
         partner_noise: chance that a frozen partner plays a random action instead of its own,
             so that the ego meets more than the conventions of the partners it trains with.
     """
@@ -66,6 +69,8 @@ class PPOConfig:
     random_start_until: float = 0.5
     final_random_start: float = 0.4
     normalise: bool = False
+    guidance: float = 0.0
+    guidance_until: float = 0.5
     partner_noise: float = 0.0
 
     def __post_init__(self):
@@ -95,7 +100,7 @@ class Batch(PyTreeNode):
     """One player's experience; leading axes [T, env].
 
     `observation` is all that the networks read: an array, or a tree of what a player with a
-    memory reads.
+    memory reads. `guide` is what a guide would do there, None where nobody guides.
     """
 
     observation: Any
@@ -104,6 +109,7 @@ class Batch(PyTreeNode):
     value: jax.Array
     advantage: jax.Array
     target: jax.Array
+    guide: Any = None
 
 
 def generalised_advantages(
@@ -147,12 +153,20 @@ def ppo_loss(
     critic: Any,
     config: PPOConfig,
     entropy_weight: jax.Array,
+    guidance: jax.Array | float = 0.0,
 ) -> jax.Array:
-    """The loss of one minibatch; `actor` and `critic` are the modules of the two trees."""
+    """The loss of one minibatch; `actor` and `critic` are the modules of the two trees.
+
+    A player with a guide pays `guidance` times its divergence from what the guide would do, mean
+    over the batch (kickstarting, Schmitt et al., 2018, Eq. 3).
+    """
     actor_params, critic_params = params
     distribution = actor.apply(actor_params, batch.observation)
     value = critic.apply(critic_params, batch.observation)
-    return clipped_loss(distribution, value, batch, config, entropy_weight)
+    loss = clipped_loss(distribution, value, batch, config, entropy_weight)
+    if batch.guide is None:
+        return loss
+    return loss + guidance * jnp.mean(networks.kl(batch.guide, distribution))
 
 
 def clipped_loss(

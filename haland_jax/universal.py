@@ -72,7 +72,11 @@ def member_styles(env: Labelled, seeds: int) -> StylesByGame:
 
 
 def init_universal(
-    env: Labelled, config: UniversalConfig, key: jax.Array, partners: Policy
+    env: Labelled,
+    config: UniversalConfig,
+    key: jax.Array,
+    partners: Policy,
+    guides: Policy | None = None,
 ) -> TrainState:
     """Starts the egos of both variants.
 
@@ -81,6 +85,8 @@ def init_universal(
         config: how many egos.
         key: consumed.
         partners: frozen partners, leading axes [style, seed].
+        guides: for `PPOConfig.guidance`, an actor for each style that reads the plain
+            observation, leading axis [style].
 
     Returns:
         Training states with leading axis [variant * seed].
@@ -94,15 +100,25 @@ def init_universal(
     count = jax.tree.leaves(everyone)[0].shape[0]
     ppo.expect_equal_shares("universal.training", training, count, "partners of all styles")
 
+    labelled = None if guides is None else _with_labels(env, guides)
+
     def init_ego(everyone: Policy, key: jax.Array, styles: StylesByGame) -> TrainState:
         learner_key, train_key = jax.random.split(key)
         size = env.observation_sizes.ego
         ego = init_learner(learner_key, actors.ego, critic, size, training)
-        return ppo.init_train_state(env, training, train_key, ego, everyone, styles)
+        return ppo.init_train_state(env, training, train_key, ego, everyone, styles, labelled)
 
     keys = jnp.tile(jax.random.split(key, config.seeds), len(VARIANTS))
     start = over_population(init_ego, shared=1, compiler_options=env.compiler_options)
     return start(everyone, keys, member_styles(env, config.seeds))
+
+
+def _with_labels(env: Labelled, policies: Policy) -> Policy:
+    """Policies [style] of the plain observation that read one with a label and ignore that."""
+    labels = len(env.style_names)
+    first = policies["params"]["dense_0"]
+    kernel = jnp.pad(first["kernel"], ((0, 0), (0, labels), (0, 0)))
+    return {**policies, "params": {**policies["params"], "dense_0": {**first, "kernel": kernel}}}
 
 
 def fold_label(params: Any, label: jax.Array) -> Any:

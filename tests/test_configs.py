@@ -4,6 +4,7 @@ import pytest
 
 import envs
 from experiments import configs
+from experiments.methods.universal import FeedForwardEgos
 
 NAMES = envs.names(styled_only=True)
 
@@ -29,3 +30,11 @@ def test_where_best_responses_start_from_the_universal_ego_it_learns_for_long():
     assert kitchen.partners.universal_refit.learning_rate < plain.partners.refit.learning_rate
     larger = configs.overnight("overcooked/center_pots", 0)
     assert larger.universal == configs.overnight("overcooked/crossway", 0).universal
+
+
+def test_only_the_egos_that_best_responses_start_from_are_guided():
+    kitchen = configs.quick("overcooked/diverse_orders", 0)
+    assert kitchen.universal.training.guidance > 0
+    compared = FeedForwardEgos()._training(kitchen, 20_000_000)
+    assert compared.guidance == 0
+    assert compared.entropy == kitchen.universal.training.entropy

@@ -109,8 +109,16 @@ def test_the_loss_by_hand():
         advantage=jnp.asarray(advantage),
         target=jnp.asarray(target),
     )
-    found = ppo_loss((actor_params, critic_params), batch, actor, critic, config, 0.3)
+    params = actor_params, critic_params
+    found = ppo_loss(params, batch, actor, critic, config, 0.3)
     assert float(found) == pytest.approx(expected, rel=1e-5)
+
+    # A guide that would play the first action with chance 1/2, the others with 1/4 each.
+    guide = np.log([0.5, 0.25, 0.25])
+    divergence = (np.exp(guide) * (guide - log_probs)).sum(-1).mean()
+    guided = batch.replace(guide=jnp.broadcast_to(jnp.asarray(guide), (5, 2, 3)))
+    found = ppo_loss(params, guided, actor, critic, config, 0.3, 0.4)
+    assert float(found) == pytest.approx(expected + 0.4 * divergence, rel=1e-5)
 
 
 @pytest.mark.parametrize("update", [0, 1, 3])

@@ -246,6 +246,32 @@ def test_the_told_ego_learns_what_the_other_cannot():
     assert float(labelled.returns.mean()) / 5 > 0.9
 
 
+def test_a_guided_ego_plays_as_the_guide_of_its_partners_style():
+    # Nothing pays, so all that there is to learn is what the guides say.
+    game = ToyGame(ego_weight=0.0)
+    env = Labelled(game)
+    config = UniversalConfig(
+        training=dataclasses.replace(
+            TINY, total_steps=8 * 5 * 60, learning_rate=2e-2, guidance=1.0, guidance_until=10.0
+        )
+    )
+    guides = jax.tree.map(
+        lambda *leaves: jnp.stack(leaves), *[always(action, 3, 3, 64) for action in (0, 2)]
+    )
+    frozen = frozen_partners([[0], [1]])
+    state = universal.init_universal(env, config, jax.random.key(0), frozen, guides)
+    state, _ = train(env, config, state, config.training.num_updates)
+    told = universal.players_by_style(env, Player.of(state.ego))[universal.TOLD_THE_STYLE].actor
+    for style, action in enumerate((0, 2)):
+        ego = jax.tree.map(lambda leaf, style=style: leaf[style, 0], told)
+        chances = jax.nn.softmax(networks.act(ego, jnp.array([1.0, 0.4, 0.5])))
+        assert float(chances[action]) > 0.9
+
+
+def test_guidance_falls_linearly_to_nothing():
+    assert [float(ppo.fading(2.0, 0.5, p)) for p in (0.0, 0.25, 0.5, 0.75)] == [2.0, 1.0, 0.0, 0.0]
+
+
 class Killed(BaseException):
     """Stands for a process that dies."""
 

@@ -82,7 +82,10 @@ class RecurrentEgos:
 
 
 class FeedForwardEgos:
-    """A General and an Instructed Ego without a memory: the run's universal egos, for `steps`."""
+    """A General and an Instructed Ego without a memory: the run's universal egos, for `steps`.
+
+    Nobody guides them (`PPOConfig.guidance`): what they know they have found out for themselves.
+    """
 
     budgeted = True
 
@@ -122,7 +125,7 @@ class FeedForwardEgos:
         )
 
     def _training(self, config: RunConfig, steps: int) -> PPOConfig:
-        return dataclasses.replace(config.universal.training, total_steps=steps)
+        return dataclasses.replace(config.universal.training, total_steps=steps, guidance=0.0)
 
 
 def one_after_another(egos: Policy | UniversalEgo, seeds: int) -> MakeEgo:

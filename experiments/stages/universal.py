@@ -33,12 +33,16 @@ def train_universal_in(
         task: the progress.
     """
     config, env = run.config.universal, Labelled(game)
-    teachers = partners.teachers(run.env, run.config.partners, load_population(run))
+    population = load_population(run)
+    teachers = partners.teachers(run.env, run.config.partners, population)
+    # Egos of pairs are at a loss where they see less than they are used to.
+    guided = config.training.guidance > 0 and game == run.env
+    guides = population.best_train_egos.actor if guided else None
     key = run.key(STAGE)
     players, returns = train_population(
         env,
         config.training,
-        lambda: universal.init_universal(env, config, key, teachers),
+        lambda: universal.init_universal(env, config, key, teachers, guides),
         universal.member_styles(env, config.seeds),
         Saver(run.path(stage, "unfinished")),
         task.update,
