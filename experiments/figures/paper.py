@@ -125,6 +125,7 @@ def adaptive_egos(results: Results) -> Figure:
 def sentence_embedding(results: Results) -> Figure:
     """Fig. 6a: t-SNE of translated sentences before and after BERT's fine-tuning."""
     from sklearn.manifold import TSNE
+    from threadpoolctl import threadpool_limits
 
     translations = results["compared"]["no-fine-tuning"]["translations"]
     figure = new_figure(7.2, 3.7)
@@ -134,7 +135,8 @@ def sentence_embedding(results: Results) -> Figure:
         train, test = (np.asarray(spoken[name], float) for name in ("train", "test"))
         flat = np.concatenate([part.reshape(-1, part.shape[-1]) for part in (train, test)])
         perplexity = min(15.0, (len(flat) - 1) / 4)
-        places = TSNE(perplexity=perplexity, init="pca", random_state=0).fit_transform(flat)
+        with threadpool_limits(1):  # threads wait actively: beside other programs a hundred times
+            places = TSNE(perplexity=perplexity, init="pca", random_state=0).fit_transform(flat)
         first = train.shape[0] * train.shape[1]
         parts = (
             places[:first].reshape(*train.shape[:2], 2),
