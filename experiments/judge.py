@@ -4,11 +4,11 @@ from collections.abc import Callable
 from typing import Any, NamedTuple
 
 import jax
-import jax.numpy as jnp
 import numpy as np
 
 from haland_jax import partners
 from haland_jax.networks import Policy
+from haland_jax.seeds import all_pairs
 
 
 class Scores(NamedTuple):
@@ -64,7 +64,7 @@ class Judge:
         """
         styles, count = jax.tree.leaves(egos)[0].shape[:2]
         seeds = jax.tree.leaves(held_out)[0].shape[1]
-        flat_egos, flat_partners = _all_pairs(egos, held_out)
+        flat_egos, flat_partners = all_pairs(egos, held_out)
         each_style = partners.repeat_styles(self.env, seeds * count)
         found = self.scores(key, flat_egos, flat_partners, each_style)
         return found.map(lambda values: values.reshape(styles, seeds, count))
@@ -82,17 +82,6 @@ def by_style(scores: Scores, style_names: tuple[str, ...]) -> dict[str, dict[str
         style: {name: values[index] for name, values in measured.items()}
         for index, style in enumerate(style_names)
     }
-
-
-@jax.jit
-def _all_pairs(egos: Policy, partners: Policy) -> tuple[Policy, Policy]:
-    """Each style's egos beside each of its partners, leading axis [style * seed * ego]."""
-    count = jax.tree.leaves(egos)[0].shape[1]
-    seeds = jax.tree.leaves(partners)[0].shape[1]
-    repeated = jax.tree.map(lambda leaf: jnp.repeat(leaf[:, None], seeds, axis=1), egos)
-    flat = jax.tree.map(lambda leaf: leaf.reshape(-1, *leaf.shape[3:]), repeated)
-    beside = jax.tree.map(lambda leaf: jnp.repeat(leaf, count, axis=1), partners)
-    return flat, jax.tree.map(lambda leaf: leaf.reshape(-1, *leaf.shape[2:]), beside)
 
 
 @jax.jit

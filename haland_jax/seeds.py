@@ -1,4 +1,4 @@
-"""Which seeds of a style learn together, and which become training and held-out partners."""
+"""Which seeds of a style learn together, who trains, who is held out, and who plays with whom."""
 
 from typing import Any
 
@@ -7,6 +7,7 @@ import jax.numpy as jnp
 import numpy as np
 
 from haland_jax.learner import TrainState
+from haland_jax.networks import Policy
 
 
 def select_seeds(
@@ -72,6 +73,26 @@ def meet_next_partners(
     seeds = sum(circle_sizes)
     members = (seeds * np.arange(num_styles)[:, None] + np.concatenate(of_style)).reshape(-1)
     return state.replace(ego=jax.tree.map(lambda leaf: jnp.take(leaf, members, axis=0), state.ego))
+
+
+@jax.jit
+def all_pairs(egos: Policy, partners: Policy) -> tuple[Policy, Policy]:
+    """Puts each ego of a style beside each partner of it.
+
+    Args:
+        egos: leading axes [style, ego].
+        partners: leading axes [style, seed].
+
+    Returns:
+        Egos and partners of the pairs, leading axis [style * seed * ego].
+    """
+    count, seeds = (jax.tree.leaves(players)[0].shape[1] for players in (egos, partners))
+    repeated = jax.tree.map(lambda leaf: jnp.repeat(leaf[:, None], seeds, axis=1), egos)
+    beside = jax.tree.map(lambda leaf: jnp.repeat(leaf, count, axis=1), partners)
+    return (
+        jax.tree.map(lambda leaf: leaf.reshape(-1, *leaf.shape[3:]), repeated),
+        jax.tree.map(lambda leaf: leaf.reshape(-1, *leaf.shape[2:]), beside),
+    )
 
 
 @jax.jit

@@ -14,7 +14,13 @@ from experiments.stages.model import Visits
 from haland_jax import best_responses, partners
 from haland_jax.partners import PartnersConfig, Player
 from haland_jax.ppo import PPOConfig
-from haland_jax.seeds import meet_next_partners, select_from_circles, select_seeds, take_seeds
+from haland_jax.seeds import (
+    all_pairs,
+    meet_next_partners,
+    select_from_circles,
+    select_seeds,
+    take_seeds,
+)
 
 TINY = PPOConfig(
     total_steps=80, num_envs=4, rollout_steps=5, num_minibatches=2, epochs=1, confined_until=0.0
@@ -316,3 +322,12 @@ def test_refit_games_must_be_shared_by_the_partners():
     message = r"refit\.num_envs is 32; expected a multiple of 7, .* that egos learn with"
     with pytest.raises(ValueError, match=message):
         PartnersConfig(train_seeds=5, refit=odd)
+
+
+def test_each_ego_of_a_style_meets_each_of_its_partners():
+    # Two styles, three egos and two partners of each.
+    egos = jnp.array([[0, 1, 2], [3, 4, 5]])
+    frozen = jnp.array([[10, 11], [12, 13]])
+    each, beside = all_pairs(egos, frozen)
+    assert each.tolist() == [0, 1, 2, 0, 1, 2, 3, 4, 5, 3, 4, 5]
+    assert beside.tolist() == [10, 10, 10, 11, 11, 11, 12, 12, 12, 13, 13, 13]

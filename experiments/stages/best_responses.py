@@ -17,6 +17,7 @@ from experiments.training import Saver, train_population
 from haland_jax import best_responses, checkpoint, partners, task_language
 from haland_jax.networks import Policy
 from haland_jax.partners import Player, Population
+from haland_jax.seeds import all_pairs
 from haland_jax.task_language import TaskLanguage
 
 OWN, UNIVERSAL = "own ego", "universal ego"
@@ -109,19 +110,10 @@ def _universal_to_refit(
 
 def _returns_with_all(run: Run, key: jax.Array, egos: Policy, teachers: Policy) -> np.ndarray:
     """Mean return of each ego [style, ego] with all its style's teachers [style, teacher]."""
-    count, times = _num_egos(teachers), _num_egos(egos)
-    each = jax.tree.map(lambda leaf: jnp.repeat(leaf, count, axis=1), egos)
-    everyone = jax.tree.map(
-        lambda leaf: jnp.tile(leaf, (1, times) + (1,) * (leaf.ndim - 2)), teachers
-    )
-    pairs = partners.flatten(each), partners.flatten(everyone)
-    returns = mean_returns(run, key, *pairs, times * count)
-    return returns.reshape(len(returns), times, count).mean(axis=2)
-
-
-def _num_egos(by_style: Any) -> int:
-    """How many there are of each style, from leading axes [style, ego]."""
-    return jax.tree.leaves(by_style)[0].shape[1]
+    count, times = (jax.tree.leaves(players)[0].shape[1] for players in (teachers, egos))
+    each, everyone = all_pairs(egos, teachers)
+    returns = mean_returns(run, key, each, everyone, times * count)
+    return returns.reshape(-1, count, times).mean(axis=1)
 
 
 def _find_oracles(
