@@ -4,6 +4,7 @@ from pathlib import Path
 from typing import Any
 
 from experiments.configs import PRESETS, RunConfig
+from experiments.earlier import with_later_settings
 from experiments.errors import UserError, as_user_error
 from experiments.run_folder import RunFolder
 from experiments.stages import STAGE_NAMES, Run
@@ -38,7 +39,8 @@ def configuration_from(path: Path, stored: dict[str, Any]) -> RunConfig:
             f"{', '.join(PRESETS)}"
         )
     try:
-        return filled(template(stored["environment"], stored["seed"]), stored)
+        known = template(stored["environment"], stored["seed"])
+        return filled(known, with_later_settings(stored))
     except (KeyError, TypeError, ValueError) as error:
         raise UserError(
             f"config.json of the run in {path} does not fit this version ({error}); make the run "

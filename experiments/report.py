@@ -226,6 +226,8 @@ def _universal(results: Mapping[str, Any]) -> dict[str, str]:
         "one feed-forward ego trained with all partners of all styles that are not held out "
         f"({steps_in_words(trained['steps'])} steps), {{}} the style's label"
     )
+    if guided := trained.get("guided_steps"):
+        what += f"; for the first {steps_in_words(guided)} steps the pairs' egos guide it"
     return {UNIVERSAL: what.format("without"), UNIVERSAL_WITH_LABEL: what.format("with")}
 
 

@@ -21,6 +21,7 @@ from typing import Any
 
 import numpy as np
 
+from experiments.earlier import with_later_settings
 from experiments.errors import UserError
 
 _CONFIGURATION, _METRICS, _LOG, _LOCK = "config.json", "metrics.json", "log.jsonl", ".lock"
@@ -265,7 +266,7 @@ def _take_lock(path: Path) -> int:
 
 
 def _read_configuration(path: Path) -> dict[str, Any]:
-    return _read_json(path / _CONFIGURATION)
+    return with_later_settings(_read_json(path / _CONFIGURATION))
 
 
 def _compare(path: Path, made: dict[str, Any], asked: dict[str, Any]) -> None:

@@ -40,9 +40,9 @@ class PPOConfig:
         final_random_start: see `random_start`. Some random moments to the end keep both players
             from conventions that only the two of them share.
         normalise: whether learners read observations by their running mean and deviation.
-        guidance: weight of the ego's divergence from its guide at the start, where it has one; it
+        guidance: weight of the ego's divergence from its guide at the start (kickstarting); it
             falls linearly to 0.
-        guidance_until: progress, 0 to 1, at which the guidance has gone.
+        guidance_until: progress, above 0, at which the guidance has gone.
         partner_noise: chance that a frozen partner plays a random action instead of its own,
             so that the ego meets more than the conventions of the partners it trains with.
     """
@@ -84,6 +84,11 @@ class PPOConfig:
                 f"total_steps is {self.total_steps}; expected at least one batch of "
                 f"num_envs x rollout_steps = {self.num_envs * self.rollout_steps}"
             )
+
+        if self.guidance < 0:
+            raise ValueError(f"guidance is {self.guidance}; expected 0 or more")
+        if self.guidance_until <= 0:
+            raise ValueError(f"guidance_until is {self.guidance_until}; expected > 0")
 
     @property
     def steps_per_update(self) -> int:
@@ -158,7 +163,7 @@ def ppo_loss(
     """The loss of one minibatch; `actor` and `critic` are the modules of the two trees.
 
     A player with a guide pays `guidance` times its divergence from what the guide would do, mean
-    over the batch (kickstarting, Schmitt et al., 2018, Eq. 3).
+    over the batch (kickstarting, Schmitt et al., 2018; their cross-entropy up to a constant).
     """
     actor_params, critic_params = params
     distribution = actor.apply(actor_params, batch.observation)

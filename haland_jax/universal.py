@@ -6,7 +6,8 @@ has an equal share of the games, and the games of each partner have that partner
 
 Egos that are told the style's one-hot and egos that are told nothing learn in one program:
 members [variant, seed], in the order of `VARIANTS`. Both have a slot for the label. The same
-seed starts both from the same parameters.
+seed starts both from the same parameters. Early in training both may be drawn to what guides do,
+one for the games of each style (`PPOConfig.guidance`).
 """
 
 import dataclasses
@@ -85,15 +86,21 @@ def init_universal(
         config: how many egos.
         key: consumed.
         partners: frozen partners, leading axes [style, seed].
-        guides: for `PPOConfig.guidance`, an actor for each style that reads the plain
-            observation, leading axis [style].
+        guides: an actor for each style that reads the plain observation, leading axis [style];
+            given where `PPOConfig.guidance` says so, and only there.
 
     Returns:
         Training states with leading axis [variant * seed].
 
     Raises:
-        ValueError: the partners cannot share the games in equal parts.
+        ValueError: the partners cannot share the games in equal parts; guides are given that
+            nobody follows, or lack.
     """
+    if (guides is not None) != (config.training.guidance > 0):
+        raise ValueError(
+            f"universal.training.guidance is {config.training.guidance}, but guides are "
+            f"{'not ' if guides is None else ''}given; expected both or neither"
+        )
     actors, critic = make_networks(env)
     everyone = flatten(partners)
     training = config.training

@@ -32,6 +32,7 @@ TRAINING = PPOConfig(
     confined_until=0.0,
     normalise=True,
 )
+GUIDED = dataclasses.replace(TRAINING, guidance=1.0, guidance_until=0.25)
 SHORT = dataclasses.replace(TRAINING, total_steps=1200)
 GOOD = -1.0
 """Mean return of a game; pairs that have learnt nothing earn less than -3."""
@@ -53,7 +54,7 @@ def run(tmp_path_factory):
             oracle_candidates=2,
             evaluation_games=16,
         ),
-        universal=UniversalConfig(training=TRAINING),
+        universal=UniversalConfig(training=GUIDED),
     )
     path = tmp_path_factory.mktemp("toy") / "run"
     task = SimpleNamespace(update=lambda *_: None)
@@ -99,6 +100,7 @@ def test_best_responses_and_oracles_earn_what_is_written_of_them(run):
 
 
 def test_the_universal_ego_plays_as_it_learnt(run):
-    made, _ = run
+    made, metrics = run
+    assert metrics["universal"]["guided_steps"] == metrics["universal"]["steps"] / 4
     told = load_universal(made)[TOLD_THE_STYLE].actor
     assert replay(made.env, told, load_population(made).train_partners).min() > GOOD

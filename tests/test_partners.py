@@ -170,6 +170,7 @@ def test_all_egos_start_alike_and_all_partners_apart(pairs):
 def test_the_population_holds_the_chosen_pairs(pairs, population):
     np.testing.assert_array_equal(mark(population.train_egos.actor), [[1, 4], [9, 7]])
     np.testing.assert_array_equal(mark(population.held_out_egos.actor), [[3, 0], [8, 6]])
+    np.testing.assert_array_equal(mark(population.best_train_egos.actor), [1, 9])
     for kept, members in (
         (population.train_partners, [[1, 4], [9, 7]]),
         (population.held_out_partners, [[3, 0], [8, 6]]),

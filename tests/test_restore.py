@@ -14,11 +14,12 @@ from safetensors import safe_open
 from experiments import compare, pipeline, players, record, restore
 from experiments.compared import PLAYER_STAGES, PLAYERS
 from experiments.errors import UserError
-from experiments.finished_run import open_run
+from experiments.finished_run import configuration_from, open_run
 from experiments.stages import load_archive, load_population, load_task_language
 from haland_jax import partners
 
-EXAMPLE = Path(__file__).parent.parent / "docs" / "examples" / "retrieval.py"
+DOCS = Path(__file__).parent.parent / "docs"
+EXAMPLE = DOCS / "examples" / "retrieval.py"
 
 
 @pytest.fixture(scope="module")
@@ -108,6 +109,22 @@ def test_what_a_record_does_not_hold_is_refused(capsys, monkeypatch, recorded, r
         line = refused(capsys, monkeypatch, restore, bad, "--out", tmp_path / "run")
         assert said in line
         assert not (tmp_path / "run").exists()
+
+
+@pytest.mark.parametrize(
+    "record_folder",
+    sorted(file.parent.relative_to(DOCS) for file in (DOCS / "comparisons").rglob(PLAYERS)),
+    ids=str,
+)
+def test_the_records_of_the_repository_fit_this_version(record_folder):
+    # Whatever settings have been added since, a record says of them what was done.
+    _, texts = players.read(DOCS / record_folder / PLAYERS)
+    config = configuration_from(record_folder, texts["config"])
+    assert f"{config.environment}" == "/".join(record_folder.parts[1:])
+    before = "guidance" not in texts["config"]["universal"]["training"]
+    assert config.universal.training.guidance == 0 or not before
+    if "universal_rate" not in texts["config"]["partners"]:
+        assert config.partners.universal_refit == config.partners.refit
 
 
 def test_half_precision_is_for_policies_that_fit_into_it():

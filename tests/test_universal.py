@@ -268,6 +268,34 @@ def test_a_guided_ego_plays_as_the_guide_of_its_partners_style():
         assert float(chances[action]) > 0.9
 
 
+def test_guides_see_what_they_are_used_to_whatever_the_label_is():
+    env = Labelled(ToyGame())
+    actor = networks.MLPActor(3, (4, 4))
+    keys = jax.random.split(jax.random.key(0), 2)
+    guides = jax.vmap(lambda key: actor.init(key, jnp.zeros(3)))(keys)
+    guides = jax.tree.map(lambda leaf: leaf + 0.3, guides)
+    seen, label = jnp.array([0.2, -1.0, 0.5]), jnp.array([0.7, -2.0])
+    labelled = universal._with_labels(env, guides)
+    for style in range(2):
+        plain, told = (
+            jax.tree.map(lambda leaf, style=style: leaf[style], policies)
+            for policies in (guides, labelled)
+        )
+        np.testing.assert_allclose(
+            networks.act(told, jnp.concatenate([seen, label])), networks.act(plain, seen), rtol=1e-6
+        )
+
+
+@pytest.mark.parametrize("guidance", [0.0, 1.0])
+def test_guides_are_given_where_they_are_followed_and_only_there(guidance):
+    config = UniversalConfig(training=dataclasses.replace(TINY, guidance=guidance))
+    guides = None if guidance else frozen_partners([[0], [1]])
+    with pytest.raises(ValueError, match="expected both or neither"):
+        universal.init_universal(
+            Labelled(ToyGame()), config, jax.random.key(0), frozen_partners([[0], [1]]), guides
+        )
+
+
 def test_guidance_falls_linearly_to_nothing():
     assert [float(ppo.fading(2.0, 0.5, p)) for p in (0.0, 0.25, 0.5, 0.75)] == [2.0, 1.0, 0.0, 0.0]
 
@@ -276,11 +304,13 @@ class Killed(BaseException):
     """Stands for a process that dies."""
 
 
-def test_interrupted_training_ends_alike(monkeypatch, tmp_path):
+@pytest.mark.parametrize("guidance", [0.0, 1.0])
+def test_interrupted_training_ends_alike(monkeypatch, tmp_path, guidance):
     env = Labelled(ToyGame())
     config = dataclasses.replace(
-        CONFIG, training=dataclasses.replace(TINY, total_steps=160), seeds=1
+        CONFIG, training=dataclasses.replace(TINY, total_steps=160, guidance=guidance), seeds=1
     )
+    guides = jax.tree.map(lambda leaf: leaf[None].repeat(2, axis=0), always(2, 3, 3, 64))
     assert config.training.num_updates == 4
     frozen = frozen_partners([[0], [1]])
 
@@ -292,7 +322,9 @@ def test_interrupted_training_ends_alike(monkeypatch, tmp_path):
         return training.train_population(
             env,
             config.training,
-            lambda: universal.init_universal(env, config, jax.random.key(0), frozen),
+            lambda: universal.init_universal(
+                env, config, jax.random.key(0), frozen, guides if guidance else None
+            ),
             universal.member_styles(env, config.seeds),
             training.Saver(path),
             report,

@@ -135,7 +135,8 @@ def sentence_embedding(results: Results) -> Figure:
         train, test = (np.asarray(spoken[name], float) for name in ("train", "test"))
         flat = np.concatenate([part.reshape(-1, part.shape[-1]) for part in (train, test)])
         perplexity = min(15.0, (len(flat) - 1) / 4)
-        with threadpool_limits(1):  # threads wait actively: beside other programs a hundred times
+        # Threads wait busily: two take a hundred times as long as one beside another program.
+        with threadpool_limits(1):
             places = TSNE(perplexity=perplexity, init="pca", random_state=0).fit_transform(flat)
         first = train.shape[0] * train.shape[1]
         parts = (

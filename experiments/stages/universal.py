@@ -11,6 +11,7 @@ from experiments.stages.context import Run
 from experiments.stages.population import load_population
 from experiments.training import Saver, curves_of, train_population
 from haland_jax import checkpoint, partners, universal
+from haland_jax.learner import TrainState
 from haland_jax.partners import Player
 
 STAGE = "universal"
@@ -33,27 +34,32 @@ def train_universal_in(
         task: the progress.
     """
     config, env = run.config.universal, Labelled(game)
-    population = load_population(run)
-    teachers = partners.teachers(run.env, run.config.partners, population)
-    # Egos of pairs are at a loss where they see less than they are used to.
-    guided = config.training.guidance > 0 and game == run.env
-    guides = population.best_train_egos.actor if guided else None
-    key = run.key(STAGE)
+    training = config.training
     players, returns = train_population(
         env,
-        config.training,
-        lambda: universal.init_universal(env, config, key, teachers, guides),
+        training,
+        lambda: _start(run, env),
         universal.member_styles(env, config.seeds),
         Saver(run.path(stage, "unfinished")),
         task.update,
         "universal egos",
     )
     checkpoint.save(run.path(stage, "egos"), players.ego)
+    steps = training.num_updates * training.steps_per_update
     return {
-        "steps": config.training.num_updates * config.training.steps_per_update,
+        "steps": steps,
+        "guided_steps": int(training.guidance_until * steps) if training.guidance else 0,
         "seeds": config.seeds,
-        **curves_of(config.training, universal.VARIANTS, returns),
+        **curves_of(training, universal.VARIANTS, returns),
     }
+
+
+def _start(run: Run, env: Labelled) -> TrainState:
+    """The egos before they learn; the egos of pairs guide them, where anybody does."""
+    config, population = run.config.universal, load_population(run)
+    teachers = partners.teachers(run.env, run.config.partners, population)
+    guides = population.best_train_egos.actor if config.training.guidance else None
+    return universal.init_universal(env, config, run.key(STAGE), teachers, guides)
 
 
 def load_universal(run: Run) -> dict[str, Player]:
@@ -63,11 +69,7 @@ def load_universal(run: Run) -> dict[str, Player]:
 
 def load_universal_in(run: Run, game: Environment, stage: str) -> dict[str, Player]:
     """The same for the egos of `train_universal_in`."""
-    config, env = run.config.universal, Labelled(game)
-    teachers = partners.teachers(run.env, run.config.partners, load_population(run))
-    shapes = jax.eval_shape(
-        lambda key: universal.init_universal(env, config, key, teachers), jax.random.key(0)
-    )
-    like = jax.eval_shape(Player.of, shapes.ego)
+    env = Labelled(game)
+    like = jax.eval_shape(lambda: Player.of(_start(run, env).ego))
     egos = checkpoint.restore(run.path(stage, "egos"), like)
     return universal.players_by_style(env, egos)
