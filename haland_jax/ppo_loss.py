@@ -84,7 +84,6 @@ class PPOConfig:
                 f"total_steps is {self.total_steps}; expected at least one batch of "
                 f"num_envs x rollout_steps = {self.num_envs * self.rollout_steps}"
             )
-
         if self.guidance < 0:
             raise ValueError(f"guidance is {self.guidance}; expected 0 or more")
         if self.guidance_until <= 0:
