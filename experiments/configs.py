@@ -10,7 +10,7 @@ from haland_jax.partners import PartnersConfig, best_response_config, oracle_con
 from haland_jax.policy_vae import PolicyVAEConfig
 from haland_jax.ppo import PPOConfig
 from haland_jax.translator import TranslatorConfig
-from haland_jax.universal import UniversalConfig, universal_config
+from haland_jax.universal import TOLD_THE_STYLE, UniversalConfig, universal_config
 
 DEFAULT_ENVIRONMENT = "overcooked/diverse_coordination"
 
@@ -26,12 +26,15 @@ class Adaptation:
         joint: settings of the joint training that differ.
         refit: settings of the best responses' refits that differ.
         partners: settings of the partners and best responses that differ.
+        spare_seeds: spare seeds of each style by preset, where the preset's leave no choice.
         joint_steps: steps of the joint training by preset, in place of `length`.
         compression: the policy VAE's fit by preset, where the preset's is too short.
         universal_games: games in parallel of the universal egos by preset, where those of the
             preset cannot be shared by the partners in equal parts.
         universal_start: steps of the universal egos by preset, where best responses start from
             them too and the preset does not foresee it.
+        told_start: where that is so, from the one that is told the style; the other does not learn,
+            and leaves its steps to it.
         universal: settings of the universal egos' training that differ.
         training: settings of every training that differ; with `normalise` the policy VAE
             compresses normalised policies too.
@@ -43,10 +46,12 @@ class Adaptation:
     joint: Mapping[str, Any] = dataclasses.field(default_factory=dict)
     refit: Mapping[str, Any] = dataclasses.field(default_factory=dict)
     partners: Mapping[str, Any] = dataclasses.field(default_factory=dict)
+    spare_seeds: Mapping[str, int] = dataclasses.field(default_factory=dict)
     joint_steps: Mapping[str, int] = dataclasses.field(default_factory=dict)
     compression: Mapping[str, FitConfig] = dataclasses.field(default_factory=dict)
     universal_games: Mapping[str, int] = dataclasses.field(default_factory=dict)
     universal_start: Mapping[str, int] = dataclasses.field(default_factory=dict)
+    told_start: bool = False
     universal: Mapping[str, Any] = dataclasses.field(default_factory=dict)
     training: Mapping[str, Any] = dataclasses.field(default_factory=dict)
 
@@ -68,7 +73,8 @@ ADAPTATIONS = {
     ),
     # Pairs must learn to share the work in two rooms, and otherwise keep to the nearer pot: the
     # farther one pays some fifty steps after the first ingredient is put into it. `quick` has
-    # fewer steps and is content with the nearer pot. Refits of their egos jam with some partners
+    # fewer steps and is content with the nearer pot. Partners who knew one ego only stood still
+    # for ever beside one that fills the second pot. Refits of their egos jam with some partners
     # that they have not met, an ego that has met all styles hardly ever does; but it would be late
     # to find out that soups made on one side may pay on the far other, which the pairs' egos know.
     "overcooked/diverse_orders": Adaptation(
@@ -76,8 +82,12 @@ ADAPTATIONS = {
         joint_steps={"quick": 1_800_000},
         refit_length=2.0,
         joint={"entropy": 0.04, "final_entropy": 0.005},
+        partners={"updates_together": 25},
+        spare_seeds={"quick": 2},
         compression={"quick": _LONG_COMPRESSION},
-        universal_start={"quick": 80_000_000},
+        universal_games={"overnight": 256, "paper": 384},
+        universal_start={"quick": 160_000_000},
+        told_start=True,
         universal={
             "entropy": 0.04,
             "final_entropy": 0.005,
@@ -224,6 +234,8 @@ def _adapted(config: RunConfig) -> RunConfig:
         partners = dataclasses.replace(partners, universal_start=True)
         steps = change.universal_start[config.preset]
         training = dataclasses.replace(training, total_steps=steps)
+        if change.told_start:
+            universal = dataclasses.replace(universal, variants=(TOLD_THE_STYLE,))
     return dataclasses.replace(
         config,
         max_steps=min(config.max_steps, change.max_steps),
@@ -232,6 +244,7 @@ def _adapted(config: RunConfig) -> RunConfig:
             joint=joint,
             refit=changed(partners.refit, change.refit_length, **change.refit),
             oracle=changed(partners.oracle),
+            spare_seeds=change.spare_seeds.get(config.preset, partners.spare_seeds),
             **change.partners,
         ),
         compression=dataclasses.replace(

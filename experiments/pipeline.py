@@ -13,7 +13,6 @@ from experiments.machine import describe_machine
 from experiments.progress import RunProgress
 from experiments.run_folder import RunFolder
 from experiments.stages import STAGES, Run
-from haland_jax.universal import VARIANTS
 
 EVALUATION, REPORT = "evaluation", "report"
 NUM_METHODS = 8
@@ -103,9 +102,9 @@ def _universal(run: Run, measured: dict[str, Any]) -> dict[str, Any]:
     config = run.config.partners
     styles = len(run.env.style_names)
     pairs = styles * config.known_seeds * config.joint.num_updates * config.joint.steps_per_update
-    egos = len(VARIANTS) * measured["seeds"] if config.universal_start else 0
+    egos = len(run.config.universal.variants) * measured["seeds"] if config.universal_start else 0
     refits = styles * config.train_seeds * config.refit_updates * config.refit.steps_per_update
-    kept = ("steps", "seeds", "curve_steps", "curve_returns")
+    kept = ("steps", "guided_steps", "seeds", "curve_steps", "curve_returns")
     return {
         **{name: measured[name] for name in kept},
         "best_response_steps": pairs + egos * measured["steps"] + refits,

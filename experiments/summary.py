@@ -30,8 +30,10 @@ METHODS = (
     WRONG,
 )
 """The method itself, step by step."""
-COMPARISONS = (UNIVERSAL, UNIVERSAL_WITH_LABEL)
-"""What else every run measures."""
+EGO_FOR_ALL = {"told nothing": UNIVERSAL, "told the style": UNIVERSAL_WITH_LABEL}
+"""The names of a run's universal egos by what they are told (`haland_jax.universal.VARIANTS`)."""
+COMPARISONS = tuple(EGO_FOR_ALL.values())
+"""What else runs measure; one that has a single universal ego measures that."""
 PARTNER_SIGHT = "partner_sight"
 """Where results.json has the comparisons with egos that see the partner only nearby."""
 
@@ -120,11 +122,12 @@ def sight_shares(results: Mapping[str, Any]) -> dict[str, dict[str, np.ndarray]]
     Returns:
         By "everywhere", "2 cells" and so on, by method: `ratios`, [style, seed].
     """
-    found = {"everywhere": {method: ratios(results, method) for method in COMPARISONS}}
+    there = [method for method in COMPARISONS if method in results["methods"]]
+    found = {"everywhere": {method: ratios(results, method) for method in there}}
     for measured in results.get(PARTNER_SIGHT, []):
         seen = f"{measured['cells']} cell{'s' * (measured['cells'] != 1)} away"
         nearby = {**results, "methods": measured["methods"]}
-        found[seen] = {method: ratios(nearby, method) for method in COMPARISONS}
+        found[seen] = {method: ratios(nearby, method) for method in there}
     return found
 
 
