@@ -4,6 +4,7 @@ import pytest
 
 import envs
 from experiments import configs
+from experiments.adaptations import ADAPTATIONS
 from experiments.methods.universal import FeedForwardEgos
 from haland_jax.universal import TOLD_THE_STYLE, VARIANTS
 
@@ -18,7 +19,7 @@ def test_every_preset_is_a_run_of_every_environment(environment, preset):
     known = config.partners
     for training in (known.joint, known.refit, known.oracle, config.universal.training):
         assert training.num_updates > 0
-    assert set(configs.ADAPTATIONS) <= set(NAMES)
+    assert set(ADAPTATIONS) <= set(NAMES)
 
 
 def test_where_best_responses_start_from_the_universal_ego_it_learns_for_long():
