@@ -25,8 +25,6 @@ class Adaptation:
             preset cannot be shared by the partners in equal parts.
         universal_start: steps of the universal egos by preset, where best responses start from
             them too and the preset does not foresee it.
-        told_start: where that is so, from the one that is told the style; the other does not learn,
-            and leaves its steps to it.
         universal: settings of the universal egos' training that differ.
         training: settings of every training that differ; with `normalise` the policy VAE
             compresses normalised policies too.
@@ -43,7 +41,6 @@ class Adaptation:
     compression: Mapping[str, FitConfig] = dataclasses.field(default_factory=dict)
     universal_games: Mapping[str, int] = dataclasses.field(default_factory=dict)
     universal_start: Mapping[str, int] = dataclasses.field(default_factory=dict)
-    told_start: bool = False
     universal: Mapping[str, Any] = dataclasses.field(default_factory=dict)
     training: Mapping[str, Any] = dataclasses.field(default_factory=dict)
 
@@ -74,12 +71,11 @@ ADAPTATIONS = {
         joint_steps={"quick": 1_800_000},
         refit_length=2.0,
         joint={"entropy": 0.04, "final_entropy": 0.005},
-        partners={"updates_together": 25},
+        partners={"updates_together": 25, "told_start": True},
         spare_seeds={"quick": 2},
         compression={"quick": LONG_COMPRESSION},
         universal_games={"overnight": 256, "paper": 384},
         universal_start={"quick": 160_000_000},
-        told_start=True,
         universal={
             "entropy": 0.04,
             "final_entropy": 0.005,

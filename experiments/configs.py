@@ -11,7 +11,7 @@ from haland_jax.partners import PartnersConfig, best_response_config, oracle_con
 from haland_jax.policy_vae import PolicyVAEConfig
 from haland_jax.ppo import PPOConfig
 from haland_jax.translator import TranslatorConfig
-from haland_jax.universal import TOLD_THE_STYLE, UniversalConfig, universal_config
+from haland_jax.universal import UniversalConfig, universal_config
 
 DEFAULT_ENVIRONMENT = "overcooked/diverse_coordination"
 
@@ -119,8 +119,6 @@ def _adapted(config: RunConfig) -> RunConfig:
         partners = dataclasses.replace(partners, universal_start=True)
         steps = change.universal_start[config.preset]
         training = dataclasses.replace(training, total_steps=steps)
-        if change.told_start:
-            universal = dataclasses.replace(universal, variants=(TOLD_THE_STYLE,))
     return dataclasses.replace(
         config,
         max_steps=min(config.max_steps, change.max_steps),

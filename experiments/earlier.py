@@ -31,9 +31,8 @@ def with_later_settings(stored: dict[str, Any]) -> dict[str, Any]:
         if training:
             training.setdefault("guidance", 0.0)
             training.setdefault("guidance_until", 0.5)
-    if "universal" in filled:
-        filled["universal"].setdefault("variants", ["told nothing", "told the style"])
     partners = filled.get("partners", {})
     if "refit" in partners:
         partners.setdefault("universal_rate", partners["refit"]["learning_rate"])
+        partners.setdefault("told_start", False)
     return filled

@@ -24,7 +24,7 @@ from experiments.stages import (
     load_universal,
     load_vae,
 )
-from experiments.summary import BEST_RESPONSE, EGO_FOR_ALL, ORACLE
+from experiments.summary import BEST_RESPONSE, COMPARISONS, ORACLE
 from experiments.summary import HEADLINE as TEST_SENTENCES
 from experiments.summary import WRONG as WRONG_SENTENCE
 from haland_jax import partners, policy_vae
@@ -79,9 +79,8 @@ def evaluate(run: Run, task: StageProgress) -> dict[str, Any]:
     right = nearest_is_right(haland, translated[TEST_SENTENCES])
     upper_bounds = env.upper_bounds()
     gate = policy_vae_gate(run, judge, next(keys))
-    for variant, players in load_universal(run).items():
-        scores = judge.with_held_out(next(keys), players.actor, held_out)
-        results[EGO_FOR_ALL[variant]] = over_egos(scores)
+    for method, players in zip(COMPARISONS, load_universal(run).values(), strict=True):
+        results[method] = over_egos(judge.with_held_out(next(keys), players.actor, held_out))
         task.update(task.done + 1)
     return {
         "methods": {

@@ -53,7 +53,7 @@ def model_of_run(path: Path) -> TrainedModel:
 
     run = open_run(path)
     language = load_task_language(run)
-    untold = load_universal(run).get(TOLD_NOTHING)  # [style, seed]; the same for all styles
+    untold = load_universal(run)[TOLD_NOTHING].actor  # [style, seed]; the same for all styles
     return TrainedModel(
         env=run.env,
         haland=load_haland(run),
@@ -61,7 +61,7 @@ def model_of_run(path: Path) -> TrainedModel:
         oracles=load_archive(run).oracles,
         event_names=language.event_names,
         event_scale=language.scale,
-        universal=untold and jax.tree.map(lambda leaf: leaf[0], untold.actor),
+        universal=jax.tree.map(lambda leaf: leaf[0], untold),
     )
 
 

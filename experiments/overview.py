@@ -234,7 +234,7 @@ def _upper_bounds(
 
 
 def _sights(results: Mapping[str, Any]) -> tuple[tuple[str, float, float], ...]:
-    if not results.get(PARTNER_SIGHT) or UNIVERSAL not in results["methods"]:
+    if not results.get(PARTNER_SIGHT):
         return ()
     return tuple(
         (seen, mean(by_method[UNIVERSAL]), mean(by_method[UNIVERSAL_WITH_LABEL]))

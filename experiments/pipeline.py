@@ -13,6 +13,7 @@ from experiments.machine import describe_machine
 from experiments.progress import RunProgress
 from experiments.run_folder import RunFolder
 from experiments.stages import STAGES, Run
+from haland_jax.universal import VARIANTS
 
 EVALUATION, REPORT = "evaluation", "report"
 NUM_METHODS = 8
@@ -97,17 +98,17 @@ def _universal(run: Run, measured: dict[str, Any]) -> dict[str, Any]:
     """How the universal egos learnt, and what the best responses cost beside them.
 
     They cost the pairs that they start from, those of held-out partners not among them, the
-    universal egos where some start from these, and their refits.
+    universal egos that they may start from, and their refits.
     """
     config = run.config.partners
     styles = len(run.env.style_names)
     pairs = styles * config.known_seeds * config.joint.num_updates * config.joint.steps_per_update
-    egos = len(run.config.universal.variants) * measured["seeds"] if config.universal_start else 0
+    starts = (1 if config.told_start else len(VARIANTS)) if config.universal_start else 0
     refits = styles * config.train_seeds * config.refit_updates * config.refit.steps_per_update
     kept = ("steps", "guided_steps", "seeds", "curve_steps", "curve_returns")
     return {
         **{name: measured[name] for name in kept},
-        "best_response_steps": pairs + egos * measured["steps"] + refits,
+        "best_response_steps": pairs + starts * measured["seeds"] * measured["steps"] + refits,
     }
 
 

@@ -268,13 +268,11 @@ def _sights(results: Mapping[str, Any]) -> str:
     """The same for egos that see the partner only nearby, where that was measured."""
     if not results.get(PARTNER_SIGHT):
         return ""
-    by_sight = sight_shares(results)
     rows = [
-        (seen, *(f"{mean(shares):.3f}" for shares in by_method.values()))
-        for seen, by_method in by_sight.items()
+        (seen, *(f"{mean(by_method[method]):.3f}" for method in COMPARISONS))
+        for seen, by_method in sight_shares(results).items()
     ]
-    methods = list(by_sight["everywhere"])
-    table = _table(("ego sees the partner", *methods), rows, "l" + "r" * len(methods))
+    table = _table(("ego sees the partner", *COMPARISONS), rows, "lrr")
     return (
         f"{table}\n\nShare of the Oracle, which sees the partner everywhere. Partners and kitchen "
         "are the same;\nonly the ego's view of the partner ends at that many rows and columns."

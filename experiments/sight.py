@@ -25,7 +25,7 @@ from experiments import devices
 from experiments.errors import UserError, main_guard
 from experiments.progress import RunProgress, StageProgress
 from experiments.run_folder import RunFolder
-from experiments.summary import EGO_FOR_ALL, PARTNER_SIGHT, mean, sight_shares
+from experiments.summary import COMPARISONS, PARTNER_SIGHT, mean, sight_shares
 
 
 @dataclasses.dataclass(frozen=True)
@@ -93,11 +93,10 @@ def table_of(results: dict[str, Any]) -> Table:
     """The shares of the Oracle as a table for the terminal."""
     table = Table(title=f"{results['environment']}: one ego for all styles, share of the Oracle")
     table.add_column("sees the partner")
-    by_sight = sight_shares(results)
-    for method in by_sight["everywhere"]:
+    for method in COMPARISONS:
         table.add_column(method, justify="right")
-    for seen, shares in by_sight.items():
-        table.add_row(seen, *(f"{mean(values):.3f}" for values in shares.values()))
+    for seen, shares in sight_shares(results).items():
+        table.add_row(seen, *(f"{mean(shares[method]):.3f}" for method in COMPARISONS))
     return table
 
 
@@ -118,9 +117,9 @@ def _measure_one(run: Any, sight: int, task: StageProgress) -> dict[str, Any]:
     keys = jax.random.split(jax.random.fold_in(jax.random.key(config.seed), 2000 + sight))
     methods = {}
     egos = load_universal_in(run, env, _stage(sight))
-    for key, (variant, players) in zip(keys, egos.items(), strict=False):
+    for method, key, players in zip(COMPARISONS, keys, egos.values(), strict=True):
         scores = over_egos(judge.with_held_out(key, players.actor, held_out))
-        methods[EGO_FOR_ALL[variant]] = by_style(scores, env.style_names)
+        methods[method] = by_style(scores, env.style_names)
     return {"cells": sight, "steps": trained["steps"], "methods": methods}
 
 

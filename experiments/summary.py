@@ -30,10 +30,8 @@ METHODS = (
     WRONG,
 )
 """The method itself, step by step."""
-EGO_FOR_ALL = {"told nothing": UNIVERSAL, "told the style": UNIVERSAL_WITH_LABEL}
-"""The names of a run's universal egos by what they are told (`haland_jax.universal.VARIANTS`)."""
-COMPARISONS = tuple(EGO_FOR_ALL.values())
-"""What else runs measure; one that has a single universal ego measures that."""
+COMPARISONS = (UNIVERSAL, UNIVERSAL_WITH_LABEL)
+"""What else every run measures."""
 PARTNER_SIGHT = "partner_sight"
 """Where results.json has the comparisons with egos that see the partner only nearby."""
 
@@ -122,12 +120,11 @@ def sight_shares(results: Mapping[str, Any]) -> dict[str, dict[str, np.ndarray]]
     Returns:
         By "everywhere", "2 cells" and so on, by method: `ratios`, [style, seed].
     """
-    there = [method for method in COMPARISONS if method in results["methods"]]
-    found = {"everywhere": {method: ratios(results, method) for method in there}}
+    found = {"everywhere": {method: ratios(results, method) for method in COMPARISONS}}
     for measured in results.get(PARTNER_SIGHT, []):
         seen = f"{measured['cells']} cell{'s' * (measured['cells'] != 1)} away"
         nearby = {**results, "methods": measured["methods"]}
-        found[seen] = {method: ratios(nearby, method) for method in there}
+        found[seen] = {method: ratios(nearby, method) for method in COMPARISONS}
     return found
 
 

@@ -9,7 +9,6 @@ from experiments.standing import without_memory
 from experiments.summary import (
     BEST_RESPONSE,
     HEADLINE,
-    UNIVERSAL_WITH_LABEL,
     MethodSummary,
     return_digits,
     summarise,
@@ -51,7 +50,7 @@ def _between_styles(results: Mapping[str, Any]) -> list[str]:
 def _for_one_ego(results: Mapping[str, Any], rows: Mapping[str, MethodSummary]) -> list[str]:
     longest = without_memory(results)
     if longest is None:
-        return _for_told_ego(results, rows)
+        return []
     plain, told, steps = rows[longest[0]], rows[longest[1]], longest[2]
     digits = return_digits(row.mean for row in rows.values())
     said = [
@@ -80,19 +79,6 @@ def _for_one_ego(results: Mapping[str, Any], rows: Mapping[str, MethodSummary]) 
             f"{abs(lead):.0%} of the Oracle."
         )
     return said
-
-
-def _for_told_ego(results: Mapping[str, Any], rows: Mapping[str, MethodSummary]) -> list[str]:
-    """Where no ego that is told nothing was measured: how to, and what the told one earns."""
-    if UNIVERSAL_WITH_LABEL not in rows:
-        return []
-    told, steps = rows[UNIVERSAL_WITH_LABEL], results["universal"]["steps"]
-    return [
-        f"One feed-forward ego that was told the style, and learnt for {steps_in_words(steps)} "
-        f"steps, earns {told.mean:.{return_digits([told.mean])}f} ({told.ratio:.0%} of the "
-        f"Oracle){_budget(results)}. Best responses start from it. What one earns that is told "
-        "nothing, `python -m experiments.compare RUN --methods universal-mlp` measures."
-    ]
 
 
 def _budget(results: Mapping[str, Any]) -> str:

@@ -4,7 +4,8 @@
    out, and against those of other styles seen in a mirror (`best_response_refits`): an ego that
    knew one partner only keeps that partner's private conventions. A universal ego
    (`haland_jax.universal`) is refitted too, more gently: it brings what it learnt with others.
-   It is the one that is told the style, unless that earns clearly less (`choose_universal`).
+   It is the one that is told the style, unless that earns clearly less (`choose_universal`) and
+   the other may be it (`PartnersConfig.told_start`).
    Each style keeps the universal start, unless its own egos are clearly better, and of that start
    the egos that are as good (`best_egos`). These egos are the archive.
 2. The Oracle of a held-out partner is the best of a few egos of its style refitted to that very

@@ -88,6 +88,8 @@ class PartnersConfig:
             mirrors, where it has any.
         universal_start: also refit a universal ego for each style (`choose_universal`), and keep
             that start, unless the style's own is clearly better.
+        told_start: it is always the one that is told the style; the other is no part of the best
+            responses then, nor are its steps.
         evaluation_games: games of each pair in an evaluation.
     """
 
@@ -104,6 +106,7 @@ class PartnersConfig:
     oracle_candidates: int = 3
     mirror: bool = True
     universal_start: bool = True
+    told_start: bool = False
     evaluation_games: int = 32
 
     def __post_init__(self):

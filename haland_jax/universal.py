@@ -6,9 +6,8 @@ has an equal share of the games, and the games of each partner have that partner
 
 Egos that are told the style's one-hot and egos that are told nothing learn in one program:
 members [variant, seed], in the order of `VARIANTS`. Both have a slot for the label. The same
-seed starts both from the same parameters. Where only one of them is wanted, the other need not
-learn (`UniversalConfig.variants`). Early in training both may be drawn to what guides do, one for
-the games of each style (`PPOConfig.guidance`).
+seed starts both from the same parameters. Early in training both may be drawn to what guides do,
+one for the games of each style (`PPOConfig.guidance`).
 """
 
 import dataclasses
@@ -17,7 +16,7 @@ from typing import Any
 import jax
 import jax.numpy as jnp
 
-from envs.labelled import Labelled, LabelledStyle
+from envs.labelled import Labelled
 from haland_jax import ppo
 from haland_jax.learner import StylesByGame, TrainState, init_learner, make_networks
 from haland_jax.networks import Policy
@@ -54,35 +53,22 @@ class UniversalConfig:
 
     Attributes:
         seeds: egos of each variant.
-        variants: which there are; some of `VARIANTS`, in their order.
         training: training of one ego with all partners.
     """
 
     seeds: int = 1
-    variants: tuple[str, ...] = VARIANTS
     training: PPOConfig = dataclasses.field(default_factory=lambda: universal_config(10_000_000))
 
     def __post_init__(self):
         if self.seeds < 1:
             raise ValueError(f"seeds is {self.seeds}; expected at least 1")
-        if not self.variants or self.variants != tuple(
-            name for name in VARIANTS if name in self.variants
-        ):
-            raise ValueError(
-                f"variants is {self.variants}; expected one or more of {VARIANTS}, in that order"
-            )
 
 
-def _styles_seen(env: Labelled, variant: str) -> LabelledStyle:
-    """All styles with the labels that a variant sees, leading axis [style]."""
-    return env.styles if variant == TOLD_THE_STYLE else env.hidden_styles
-
-
-def member_styles(env: Labelled, config: UniversalConfig) -> StylesByGame:
+def member_styles(env: Labelled, seeds: int) -> StylesByGame:
     """Returns the styles of every member with the labels it sees, [variant * seed, style]."""
-    seen = [_styles_seen(env, variant) for variant in config.variants]
+    variants = (env.hidden_styles, env.styles)
     return StylesByGame(
-        jax.tree.map(lambda *leaves: jnp.repeat(jnp.stack(leaves), config.seeds, axis=0), *seen)
+        jax.tree.map(lambda *leaves: jnp.repeat(jnp.stack(leaves), seeds, axis=0), *variants)
     )
 
 
@@ -93,7 +79,7 @@ def init_universal(
     partners: Policy,
     guides: Policy | None = None,
 ) -> TrainState:
-    """Starts the egos of all variants.
+    """Starts the egos of both variants.
 
     Args:
         env: the environment, with labels.
@@ -129,9 +115,9 @@ def init_universal(
         ego = init_learner(learner_key, actors.ego, critic, size, training)
         return ppo.init_train_state(env, training, train_key, ego, everyone, styles, labelled)
 
-    keys = jnp.tile(jax.random.split(key, config.seeds), len(config.variants))
+    keys = jnp.tile(jax.random.split(key, config.seeds), len(VARIANTS))
     start = over_population(init_ego, shared=1, compiler_options=env.compiler_options)
-    return start(everyone, keys, member_styles(env, config))
+    return start(everyone, keys, member_styles(env, config.seeds))
 
 
 def _with_labels(env: Labelled, policies: Policy) -> Policy:
@@ -159,19 +145,19 @@ def fold_label(params: Any, label: jax.Array) -> Any:
     return {**params, "params": {**params["params"], "dense_0": folded}}
 
 
-def players_by_style(env: Labelled, config: UniversalConfig, egos: Player) -> dict[str, Player]:
+def players_by_style(env: Labelled, egos: Player) -> dict[str, Player]:
     """The players that each variant is with partners of each style.
 
     Args:
         env: the environment, with labels.
-        config: which egos there are.
         egos: trained egos, leading axis [variant * seed].
 
     Returns:
         By variant, players with the plain observation, leading axes [style, seed].
     """
+    labels = (env.hidden_styles.label, env.styles.label)
     by_variant: Any = jax.tree.map(
-        lambda leaf: leaf.reshape(len(config.variants), config.seeds, *leaf.shape[1:]), egos
+        lambda leaf: leaf.reshape(len(VARIANTS), -1, *leaf.shape[1:]), egos
     )
 
     def fold(ego: Player, label: jax.Array) -> Player:
@@ -186,8 +172,6 @@ def players_by_style(env: Labelled, config: UniversalConfig, egos: Player) -> di
     over_seeds = jax.vmap(fold, in_axes=(0, None))
     over_styles = jax.vmap(over_seeds, in_axes=(None, 0))
     return {
-        name: over_styles(
-            jax.tree.map(lambda leaf, i=index: leaf[i], by_variant), _styles_seen(env, name).label
-        )
-        for index, name in enumerate(config.variants)
+        name: over_styles(jax.tree.map(lambda leaf, i=index: leaf[i], by_variant), labels[index])
+        for index, name in enumerate(VARIANTS)
     }

@@ -54,7 +54,7 @@ def run(tmp_path_factory):
             oracle_candidates=2,
             evaluation_games=16,
         ),
-        universal=UniversalConfig(variants=(TOLD_THE_STYLE,), training=GUIDED),
+        universal=UniversalConfig(training=GUIDED),
     )
     path = tmp_path_factory.mktemp("toy") / "run"
     task = SimpleNamespace(update=lambda *_: None)

@@ -85,15 +85,6 @@ def test_what_the_style_is_worth_is_said_in_words(tmp_path, told, haland, expect
     assert "![cross play](figures/cross_play.png)" in said
 
 
-def test_what_the_told_ego_earns_is_said_where_there_is_no_other(tmp_path):
-    results = with_shares(made_up_results(), {summary.UNIVERSAL_WITH_LABEL: 0.8})
-    del results["methods"][summary.UNIVERSAL]
-    said = section(report.write_report(results, tmp_path).read_text(), "What the style is worth")
-    assert "was told the style, and learnt for 1.5 M steps, earns" in said
-    assert "(80% of the Oracle); all archived best responses together took 52.8 M" in said
-    assert "compare RUN --methods universal-mlp" in said
-
-
 def test_the_universal_egos_are_listed_with_their_budget(tmp_path):
     text = report.write_report(made_up_results(), tmp_path).read_text()
     line = next(line for line in text.splitlines() if line.startswith("| Universal ego |"))

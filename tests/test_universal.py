@@ -61,7 +61,7 @@ def frozen_partners(actions: list[list[int]]):
 
 def train(env, config, members, updates):
     return partners.compile_training(env, config.training, updates)(
-        members, universal.member_styles(env, config)
+        members, universal.member_styles(env, config.seeds)
     )
 
 
@@ -95,7 +95,7 @@ def test_each_game_has_its_partners_style():
     state = universal.init_universal(
         env, config, jax.random.key(0), frozen_partners([[1, 0], [0, 1]])
     )
-    one, styles = jax.tree.map(lambda leaf: leaf[1], (state, universal.member_styles(env, config)))
+    one, styles = jax.tree.map(lambda leaf: leaf[1], (state, universal.member_styles(env, 1)))
     np.testing.assert_array_equal(one.observations.ego[:, 3:], np.repeat(np.eye(2), 4, axis=0))
     _, steps = jax.jit(lambda *given: ppo._rollout(env, TINY, *given, 0.0))(
         one, styles, jax.random.key(1)
@@ -158,26 +158,6 @@ def test_both_variants_of_a_seed_start_alike_and_only_one_is_told():
     # Without a label its weights learn nothing; with it they do.
     assert (moved[:2, 3:] == 0).all()
     assert (np.abs(moved[2:, 3:]).max(axis=(1, 2)) > 0).all()
-
-
-def test_a_variant_learns_alone_as_it_does_beside_the_other():
-    env, frozen = Labelled(ToyGame()), frozen_partners([[0], [1]])
-    alone = dataclasses.replace(CONFIG, variants=(universal.TOLD_THE_STYLE,))
-    egos = {}
-    for config in (CONFIG, alone):
-        state = universal.init_universal(env, config, jax.random.key(0), frozen)
-        state, _ = train(env, config, state, 2)
-        egos[config] = universal.players_by_style(env, config, Player.of(state.ego))
-    assert tuple(egos[alone]) == (universal.TOLD_THE_STYLE,)
-    both = (egos[config][universal.TOLD_THE_STYLE].actor for config in (CONFIG, alone))
-    for beside, by_itself in zip(*map(jax.tree.leaves, both), strict=True):
-        np.testing.assert_allclose(by_itself, beside, rtol=1e-5, atol=1e-6)
-
-
-@pytest.mark.parametrize("variants", [(), ("told all",), universal.VARIANTS[::-1]])
-def test_unknown_variants_are_refused(variants):
-    with pytest.raises(ValueError, match=r"variants is .* expected one or more of"):
-        UniversalConfig(variants=variants)
 
 
 def test_a_folded_label_plays_as_the_told_ego():
@@ -244,7 +224,7 @@ def test_the_told_ego_learns_what_the_other_cannot():
     frozen = frozen_partners([[0], [1]])
     state = universal.init_universal(env, config, jax.random.key(0), frozen)
     state, _ = train(env, config, state, config.training.num_updates)
-    by_style = universal.players_by_style(env, config, Player.of(state.ego))
+    by_style = universal.players_by_style(env, Player.of(state.ego))
     assert tuple(by_style) == universal.VARIANTS
     shares = {}
     for variant, players in by_style.items():
@@ -281,9 +261,7 @@ def test_a_guided_ego_plays_as_the_guide_of_its_partners_style():
     frozen = frozen_partners([[0], [1]])
     state = universal.init_universal(env, config, jax.random.key(0), frozen, guides)
     state, _ = train(env, config, state, config.training.num_updates)
-    told = universal.players_by_style(env, config, Player.of(state.ego))[
-        universal.TOLD_THE_STYLE
-    ].actor
+    told = universal.players_by_style(env, Player.of(state.ego))[universal.TOLD_THE_STYLE].actor
     for style, action in enumerate((0, 2)):
         ego = jax.tree.map(lambda leaf, style=style: leaf[style, 0], told)
         chances = jax.nn.softmax(networks.act(ego, jnp.array([1.0, 0.4, 0.5])))
@@ -347,7 +325,7 @@ def test_interrupted_training_ends_alike(monkeypatch, tmp_path, guidance):
             lambda: universal.init_universal(
                 env, config, jax.random.key(0), frozen, guides if guidance else None
             ),
-            universal.member_styles(env, config),
+            universal.member_styles(env, config.seeds),
             training.Saver(path),
             report,
             "universal egos",

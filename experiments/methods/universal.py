@@ -14,10 +14,10 @@ from experiments.methods.base import Given, MakeEgo, Told, Trained
 from experiments.stages import Run
 from experiments.training import curves_of, train_in_pieces, train_population
 from experiments.worth import steps_in_words
-from haland_jax import recurrent_egos, recurrent_ppo, universal
+from haland_jax import recurrent_ppo, universal
 from haland_jax.networks import Policy
 from haland_jax.ppo_loss import PPOConfig
-from haland_jax.recurrent_egos import ADAPTIVE, GENERAL, INSTRUCTED, UniversalEgo
+from haland_jax.recurrent_egos import ADAPTIVE, GENERAL, INSTRUCTED, VARIANTS, UniversalEgo
 from haland_jax.rollout import Agent
 from haland_jax.universal import TOLD_NOTHING, TOLD_THE_STYLE
 
@@ -77,7 +77,7 @@ class RecurrentEgos:
             egos={name: one_after_another(agents, given.seeds) for name, agents in egos.items()},
             descriptions={name: what.format(knows) for name, knows in KNOWS.items()},
             steps=steps,
-            notes=curves_of(training, recurrent_egos.VARIANTS, returns),
+            notes=curves_of(training, VARIANTS, returns),
         )
 
 
@@ -97,22 +97,19 @@ class FeedForwardEgos:
         """Trains them by PPO with the partners of all styles together."""
         env, training = Labelled(given.env), self._training(given.run.config, given.steps)
         config = dataclasses.replace(
-            given.run.config.universal,
-            seeds=given.seeds,
-            variants=universal.VARIANTS,
-            training=training,
+            given.run.config.universal, seeds=given.seeds, training=training
         )
         players, returns = train_population(
             env,
             training,
             lambda: universal.init_universal(env, config, given.key, given.partners),
-            universal.member_styles(env, config),
+            universal.member_styles(env, given.seeds),
             given.saver_of(training),
             given.task.update,
             "universal egos without a memory",
         )
         given.keep(players.ego)
-        by_variant = universal.players_by_style(env, config, players.ego)
+        by_variant = universal.players_by_style(env, players.ego)
         egos = {
             GENERAL_MLP: by_variant[TOLD_NOTHING].actor,
             INSTRUCTED_MLP: by_variant[TOLD_THE_STYLE].actor,

@@ -39,7 +39,7 @@ def train_universal_in(
         env,
         training,
         lambda: _start(run, env),
-        universal.member_styles(env, config),
+        universal.member_styles(env, config.seeds),
         Saver(run.path(stage, "unfinished")),
         task.update,
         "universal egos",
@@ -50,7 +50,7 @@ def train_universal_in(
         "steps": steps,
         "guided_steps": int(training.guidance_until * steps) if training.guidance else 0,
         "seeds": config.seeds,
-        **curves_of(training, config.variants, returns),
+        **curves_of(training, universal.VARIANTS, returns),
     }
 
 
@@ -72,4 +72,4 @@ def load_universal_in(run: Run, game: Environment, stage: str) -> dict[str, Play
     env = Labelled(game)
     like = jax.eval_shape(lambda: Player.of(_start(run, env).ego))
     egos = checkpoint.restore(run.path(stage, "egos"), like)
-    return universal.players_by_style(env, run.config.universal, egos)
+    return universal.players_by_style(env, egos)
