@@ -11,7 +11,7 @@ from toy_reach import ToyReach
 from experiments import configs
 from experiments.run_folder import RunFolder
 from experiments.stages import Run, context, load_archive, load_population
-from experiments.stages.best_responses import make_best_responses
+from experiments.stages.best_responses import _universal_to_refit, make_best_responses
 from experiments.stages.population import make_partners
 from experiments.stages.universal import load_universal, train_universal
 from haland_jax import partners
@@ -104,3 +104,24 @@ def test_the_universal_ego_plays_as_it_learnt(run):
     assert metrics["universal"]["guided_steps"] == metrics["universal"]["steps"] / 4
     told = load_universal(made)[TOLD_THE_STYLE].actor
     assert replay(made.env, told, load_population(made).train_partners).min() > GOOD
+
+
+@pytest.mark.parametrize(("told_start", "egos"), [(False, 2), (True, 1)])
+def test_best_responses_may_start_from_the_told_ego_alone(run, told_start, egos):
+    made, _ = run
+    known = dataclasses.replace(made.config.partners, told_start=told_start)
+    asked = SimpleNamespace(
+        config=dataclasses.replace(made.config, partners=known),
+        env=made.env,
+        key=made.key,
+        path=made.path,
+    )
+    population = load_population(made)
+    teachers = partners.teachers(made.env, known, population)
+    start, chosen = _universal_to_refit(asked, jax.random.key(0), teachers)
+    assert np.shape(chosen["universal_start_returns"]) == (len(made.env.style_names), egos)
+    if told_start:
+        assert set(chosen["universal_starts"].values()) == {TOLD_THE_STYLE}
+        told = jax.tree.map(lambda leaf: leaf[:, 0], load_universal(made)[TOLD_THE_STYLE])
+        for one, two in zip(jax.tree.leaves(start), jax.tree.leaves(told), strict=True):
+            np.testing.assert_array_equal(one, two)

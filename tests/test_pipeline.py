@@ -3,10 +3,12 @@
 All that needs the finished run is in this file, so that one process makes it once.
 """
 
+import dataclasses
 import json
 import shutil
 import sys
 from pathlib import Path
+from types import SimpleNamespace
 
 import numpy as np
 import pytest
@@ -19,6 +21,7 @@ from experiments import (
     evaluate,
     evaluation,
     generate,
+    pipeline,
     run,
     sight,
     training,
@@ -95,6 +98,25 @@ def test_best_responses_cost_their_pairs_the_universal_egos_and_their_refits(res
     # 640 from each start.
     steps = 8 * 2 * 1280 + 2 * 2 * 640 + 8 * 2 * 2 * 640
     assert results["universal"]["best_response_steps"] == steps
+
+
+def test_universal_egos_that_nobody_starts_from_cost_best_responses_nothing(results):
+    config = configs.smoke(configs.DEFAULT_ENVIRONMENT, 0)
+
+    def steps(**changes) -> int:
+        changed = dataclasses.replace(config.partners, **changes)
+        run = SimpleNamespace(
+            config=dataclasses.replace(config, partners=changed),
+            env=SimpleNamespace(style_names=results["styles"]),
+        )
+        measured = {"steps": 640, "guided_steps": 0, "seeds": 2} | {
+            name: results["universal"][name] for name in ("curve_steps", "curve_returns")
+        }
+        return pipeline._universal(run, measured)["best_response_steps"]
+
+    assert steps() - steps(told_start=True) == 2 * 640
+    refits = 8 * 2 * 640
+    assert steps() - steps(universal_start=False) == 2 * 2 * 640 + refits
 
 
 def test_the_run_folder_is_complete(smoke_run, results):
