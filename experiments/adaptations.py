@@ -52,13 +52,16 @@ ADAPTATIONS = {
     # Pairs that begin at the same pot keep to it, and so do refits of their egos, beside partners
     # that would serve both; an ego that has met all styles knows better.
     "overcooked/center_pots": Adaptation(
-        compression={"quick": LONG_COMPRESSION}, universal_start={"quick": 20_000_000}
+        partners={"told_start": True},
+        compression={"quick": LONG_COMPRESSION},
+        universal_start={"quick": 40_000_000},
     ),
     # Both players must learn to give way.
     "overcooked/crossway": Adaptation(
         length=1.7,
+        partners={"told_start": True},
         compression={"quick": LONG_COMPRESSION},
-        universal_start={"quick": 20_000_000},
+        universal_start={"quick": 40_000_000},
     ),
     # Pairs must learn to share the work in two rooms, and otherwise keep to the nearer pot: the
     # farther one pays some fifty steps after the first ingredient is put into it. `quick` has

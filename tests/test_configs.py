@@ -26,7 +26,7 @@ def test_where_best_responses_start_from_the_universal_ego_it_learns_for_long():
     assert not plain.partners.universal_start
     kitchen = configs.quick("overcooked/center_pots", 0)
     assert kitchen.partners.universal_start
-    assert kitchen.universal.training.total_steps == 20_000_000
+    assert kitchen.universal.training.total_steps == 40_000_000
     assert kitchen.partners.refit == plain.partners.refit
     assert kitchen.partners.universal_refit.learning_rate < plain.partners.refit.learning_rate
     larger = configs.overnight("overcooked/center_pots", 0)
