@@ -25,6 +25,7 @@ class Adaptation:
             preset cannot be shared by the partners in equal parts.
         universal_start: steps of the universal egos by preset, where best responses start from
             them too and the preset does not foresee it.
+        told_start: whether they are `PartnersConfig.told_start` there.
         universal: settings of the universal egos' training that differ.
         training: settings of every training that differ; with `normalise` the policy VAE
             compresses normalised policies too.
@@ -41,6 +42,7 @@ class Adaptation:
     compression: Mapping[str, FitConfig] = dataclasses.field(default_factory=dict)
     universal_games: Mapping[str, int] = dataclasses.field(default_factory=dict)
     universal_start: Mapping[str, int] = dataclasses.field(default_factory=dict)
+    told_start: bool = False
     universal: Mapping[str, Any] = dataclasses.field(default_factory=dict)
     training: Mapping[str, Any] = dataclasses.field(default_factory=dict)
 
@@ -52,16 +54,16 @@ ADAPTATIONS = {
     # Pairs that begin at the same pot keep to it, and so do refits of their egos, beside partners
     # that would serve both; an ego that has met all styles knows better.
     "overcooked/center_pots": Adaptation(
-        partners={"told_start": True},
         compression={"quick": LONG_COMPRESSION},
         universal_start={"quick": 40_000_000},
+        told_start=True,
     ),
     # Both players must learn to give way.
     "overcooked/crossway": Adaptation(
         length=1.7,
-        partners={"told_start": True},
         compression={"quick": LONG_COMPRESSION},
         universal_start={"quick": 40_000_000},
+        told_start=True,
     ),
     # Pairs must learn to share the work in two rooms, and otherwise keep to the nearer pot: the
     # farther one pays some fifty steps after the first ingredient is put into it. `quick` has
@@ -74,11 +76,12 @@ ADAPTATIONS = {
         joint_steps={"quick": 1_800_000},
         refit_length=2.0,
         joint={"entropy": 0.04, "final_entropy": 0.005},
-        partners={"updates_together": 25, "told_start": True},
+        partners={"updates_together": 25},
         spare_seeds={"quick": 2},
         compression={"quick": LONG_COMPRESSION},
         universal_games={"overnight": 256, "paper": 384},
         universal_start={"quick": 160_000_000},
+        told_start=True,
         universal={
             "entropy": 0.04,
             "final_entropy": 0.005,

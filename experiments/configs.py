@@ -116,7 +116,7 @@ def _adapted(config: RunConfig) -> RunConfig:
     games = change.universal_games.get(config.preset, universal.training.num_envs)
     training = dataclasses.replace(universal.training, num_envs=games)
     if config.preset in change.universal_start:
-        partners = dataclasses.replace(partners, universal_start=True)
+        partners = dataclasses.replace(partners, universal_start=True, told_start=change.told_start)
         steps = change.universal_start[config.preset]
         training = dataclasses.replace(training, total_steps=steps)
     return dataclasses.replace(
