@@ -1,7 +1,7 @@
 """Makes a run of a record, to put further methods beside the recorded ones.
 
     python -m experiments.restore docs/comparisons/overcooked/diverse_orders
-    RUN=runs/overcooked-diverse_orders-quick-4-recorded
+    RUN=runs/overcooked-diverse_orders-quick-6-recorded
     python -m experiments.compare $RUN --methods --add mine.py
 
 The run has the recorded players, partners to learn with and held-out ones, and the recorded
