@@ -13,6 +13,10 @@ import hypothesis
 import jax
 import pytest
 
+from experiments import devices
+
+devices.collect_garbage_seldom()
+
 # Before the first computation: the code for populations must be tried on several devices.
 jax.config.update("jax_num_cpu_devices", 2)
 

@@ -272,7 +272,7 @@ def lasting(results: dict) -> dict:
 
 
 def test_a_run_killed_thrice_ends_with_the_results_of_an_uninterrupted_one(
-    monkeypatch, smoke_run, tmp_path
+    monkeypatch, no_drawing, smoke_run, tmp_path
 ):
     monkeypatch.setattr(training, "SECONDS_BETWEEN_CHECKPOINTS", 0.0)
     monkeypatch.setattr(training, "UPDATES_PER_PIECE", 4)
