@@ -88,8 +88,7 @@ class PartnersConfig:
             mirrors, where it has any.
         universal_start: also refit a universal ego for each style (`choose_universal`), and keep
             that start, unless the style's own is clearly better.
-        told_start: it is always the one that is told the style; the other is no part of the best
-            responses then, nor are its steps.
+        told_start: it is always the one that is told the style, and only its steps are counted.
         evaluation_games: games of each pair in an evaluation.
     """
 
