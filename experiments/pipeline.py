@@ -13,7 +13,7 @@ from experiments.machine import describe_machine
 from experiments.progress import RunProgress
 from experiments.run_folder import RunFolder
 from experiments.stages import STAGES, Run
-from haland_jax.universal import VARIANTS
+from haland_jax.universal import start_variants
 
 EVALUATION, REPORT = "evaluation", "report"
 NUM_METHODS = 8
@@ -103,12 +103,14 @@ def _universal(run: Run, measured: dict[str, Any]) -> dict[str, Any]:
     config = run.config.partners
     styles = len(run.env.style_names)
     pairs = styles * config.known_seeds * config.joint.num_updates * config.joint.steps_per_update
-    starts = (1 if config.told_start else len(VARIANTS)) if config.universal_start else 0
+    starts = len(start_variants(config)) * measured["seeds"]
     refits = styles * config.train_seeds * config.refit_updates * config.refit.steps_per_update
-    kept = ("steps", "guided_steps", "seeds", "curve_steps", "curve_returns")
+    kept = ("steps", "seeds", "curve_steps", "curve_returns")
     return {
         **{name: measured[name] for name in kept},
-        "best_response_steps": pairs + starts * measured["seeds"] * measured["steps"] + refits,
+        # A stage that was finished before anybody guided does not say it.
+        "guided_steps": measured.get("guided_steps", 0),
+        "best_response_steps": pairs + starts * measured["steps"] + refits,
     }
 
 

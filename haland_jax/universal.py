@@ -20,7 +20,7 @@ from envs.labelled import Labelled
 from haland_jax import ppo
 from haland_jax.learner import StylesByGame, TrainState, init_learner, make_networks
 from haland_jax.networks import Policy
-from haland_jax.partners import Player, flatten
+from haland_jax.partners import PartnersConfig, Player, flatten
 from haland_jax.population import over_population
 from haland_jax.ppo import PPOConfig
 
@@ -62,6 +62,13 @@ class UniversalConfig:
     def __post_init__(self):
         if self.seeds < 1:
             raise ValueError(f"seeds is {self.seeds}; expected at least 1")
+
+
+def start_variants(config: PartnersConfig) -> tuple[str, ...]:
+    """Returns the variants that best responses may start from; empty where from none."""
+    if not config.universal_start:
+        return ()
+    return (TOLD_THE_STYLE,) if config.told_start else VARIANTS
 
 
 def member_styles(env: Labelled, seeds: int) -> StylesByGame:

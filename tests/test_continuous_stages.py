@@ -110,12 +110,7 @@ def test_the_universal_ego_plays_as_it_learnt(run):
 def test_best_responses_may_start_from_the_told_ego_alone(run, told_start, egos):
     made, _ = run
     known = dataclasses.replace(made.config.partners, told_start=told_start)
-    asked = SimpleNamespace(
-        config=dataclasses.replace(made.config, partners=known),
-        env=made.env,
-        key=made.key,
-        path=made.path,
-    )
+    asked = Run(dataclasses.replace(made.config, partners=known), made.folder)
     population = load_population(made)
     teachers = partners.teachers(made.env, known, population)
     start, chosen = _universal_to_refit(asked, jax.random.key(0), teachers)

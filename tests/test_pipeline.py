@@ -100,23 +100,28 @@ def test_best_responses_cost_their_pairs_the_universal_egos_and_their_refits(res
     assert results["universal"]["best_response_steps"] == steps
 
 
+def as_run(config, results):
+    """As much of a run as says what its best responses cost."""
+    return SimpleNamespace(config=config, env=SimpleNamespace(style_names=results["styles"]))
+
+
 def test_universal_egos_that_nobody_starts_from_cost_best_responses_nothing(results):
     config = configs.smoke(configs.DEFAULT_ENVIRONMENT, 0)
 
     def steps(**changes) -> int:
         changed = dataclasses.replace(config.partners, **changes)
-        run = SimpleNamespace(
-            config=dataclasses.replace(config, partners=changed),
-            env=SimpleNamespace(style_names=results["styles"]),
-        )
-        measured = {"steps": 640, "guided_steps": 0, "seeds": 2} | {
-            name: results["universal"][name] for name in ("curve_steps", "curve_returns")
-        }
-        return pipeline._universal(run, measured)["best_response_steps"]
+        made = as_run(dataclasses.replace(config, partners=changed), results)
+        return pipeline._universal(made, results["universal"])["best_response_steps"]
 
     assert steps() - steps(told_start=True) == 2 * 640
     refits = 8 * 2 * 640
     assert steps() - steps(universal_start=False) == 2 * 2 * 640 + refits
+
+
+def test_egos_of_a_run_from_before_guidance_were_not_guided(results):
+    made = as_run(configs.smoke(configs.DEFAULT_ENVIRONMENT, 0), results)
+    earlier = {k: v for k, v in results["universal"].items() if k != "guided_steps"}
+    assert pipeline._universal(made, earlier) == results["universal"]
 
 
 def test_the_run_folder_is_complete(smoke_run, results):

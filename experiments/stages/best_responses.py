@@ -19,7 +19,7 @@ from haland_jax.networks import Policy
 from haland_jax.partners import Player, Population
 from haland_jax.seeds import all_pairs
 from haland_jax.task_language import TaskLanguage
-from haland_jax.universal import TOLD_THE_STYLE
+from haland_jax.universal import start_variants
 
 OWN, UNIVERSAL = "own ego", "universal ego"
 """Where the refits of best responses start."""
@@ -97,9 +97,8 @@ def _universal_to_refit(
     run: Run, key: jax.Array, teachers: Policy
 ) -> tuple[Player, dict[str, Any]]:
     """The universal ego to refit for each style, leading axis [style], and which it is."""
-    by_variant = load_universal(run)
-    if run.config.partners.told_start:
-        by_variant = {TOLD_THE_STYLE: by_variant[TOLD_THE_STYLE]}
+    trained = load_universal(run)
+    by_variant = {name: trained[name] for name in start_variants(run.config.partners)}
     egos = jax.tree.map(lambda *parts: jnp.concatenate(parts, axis=1), *by_variant.values())
     returns = _returns_with_all(run, key, egos.actor, teachers)
     best, variant = best_responses.choose_universal(returns, len(by_variant))
