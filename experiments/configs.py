@@ -181,6 +181,7 @@ def smoke(environment: str, seed: int) -> RunConfig:
             clip=8.0,
         ),
         translator=TranslatorConfig(
+            fine_tunings=2,
             fine_tuning=FitConfig(learning_rate=1e-4, steps=4, warmup_steps=1),
             translation=FitConfig(learning_rate=1e-4, steps=20, warmup_steps=5),
         ),

@@ -35,4 +35,6 @@ def with_later_settings(stored: dict[str, Any]) -> dict[str, Any]:
     if "refit" in partners:
         partners.setdefault("universal_rate", partners["refit"]["learning_rate"])
         partners.setdefault("told_start", False)
+    if "translator" in filled:
+        filled["translator"].setdefault("fine_tunings", 1)
     return filled

@@ -2,16 +2,18 @@
 
     python -m experiments.sentences overcooked/crossway
     python -m experiments.sentences assistive/jaco --seeds 3 --translator.dropout 0.2
+    python -m experiments.sentences lbf/spread --record docs/comparisons/lbf/spread
 
 The sentences of each style are dealt to folds. BERT is fine-tuned as in a run (Eq. 7) on all folds
-but one and asked for the styles of that one, each fold in turn. So settings of the translator can
-be chosen, and sentences written, without a look at the test sentences.
+but one and asked for the styles of that one, each fold in turn. With the task language of a record
+or a run, the translation (Eq. 6) is fitted and asked too. So settings of the translator can be
+chosen, and sentences written, without a look at the test sentences.
 """
 
 import dataclasses
 import itertools
-from functools import partial
-from typing import Annotated, Any
+from pathlib import Path
+from typing import Annotated
 
 import jax
 import jax.numpy as jnp
@@ -26,7 +28,8 @@ from envs.instructions import load_instructions
 from experiments import devices
 from experiments.errors import UserError, as_user_error, main_guard
 from experiments.machine import describe_machine
-from haland_jax import bert_weights, fit, translator
+from experiments.reading import read_runs
+from haland_jax import bert_weights, fit, task_language, translator
 from haland_jax.translator import SentenceData, TranslatorConfig
 
 
@@ -42,26 +45,36 @@ class Arguments:
     """Repetitions, with other random minibatches."""
     encoder: Annotated[str, tyro.conf.arg(metavar="FOLDER|NAME")] = ""
     """A BERT checkpoint; the packaged one by default."""
+    record: Annotated[Path | None, tyro.conf.arg(metavar="FOLDER")] = None
+    """A record or a run, whose task language the sentences left out are translated to."""
     translator: TranslatorConfig = dataclasses.field(default_factory=TranslatorConfig)
     """Settings of the translator."""
 
 
 @dataclasses.dataclass(frozen=True)
 class LeftOut:
-    """What the classifier said of sentences that it was not fine-tuned on.
+    """What was said of sentences that nothing was fitted to.
 
     Attributes:
-        probability: float32 [seed, sentence, style].
+        probability: the classifier's, float32 [seed, sentence, style].
         style: int [sentence], the true one.
+        translated: style whose task language is nearest to the translation, int [seed, sentence];
+            None where nothing was translated.
     """
 
     probability: np.ndarray
     style: np.ndarray
+    translated: np.ndarray | None = None
+
+    @property
+    def told(self) -> np.ndarray:
+        """int [seed, sentence]: by the translation, or by the classifier where there is none."""
+        return self.probability.argmax(-1) if self.translated is None else self.translated
 
     @property
     def right(self) -> np.ndarray:
-        """bool [seed, sentence]: is the true style the most probable one?"""
-        return self.probability.argmax(-1) == self.style
+        """bool [seed, sentence]: is the true style told?"""
+        return self.told == self.style
 
     @property
     def negative_log_likelihood(self) -> float:
@@ -77,15 +90,17 @@ def cross_validate(
     *,
     folds: int,
     seeds: int,
+    v_hat: np.ndarray | None = None,
 ) -> LeftOut:
-    """Fine-tunes without each fold in turn.
+    """Fits the translator without each fold in turn.
 
     Args:
         encoder: the pre-trained one.
-        config: settings of the fine-tuning.
+        config: settings of the translator.
         sentences: as `translator.prepare_sentences` returns them.
         folds: a style's sentence i is left out with fold i modulo `folds`.
         seeds: repetitions.
+        v_hat: task language of each style, [style, U]; without it BERT alone is fine-tuned.
 
     Raises:
         UserError: fewer than two folds, more than a style has sentences, or no repetition.
@@ -97,36 +112,89 @@ def cross_validate(
     if seeds < 1:
         raise UserError(f"seeds is {seeds}; expected at least 1")
     number = np.array([np.sum(style[:i] == style[i]) for i in range(len(style))]) % folds
-    initial = translator.init_fine_tuning(encoder, config, int(style.max()) + 1)
-    functions = translator.make_fine_tuning(encoder.architecture, config)
-    chunk = fit.make_fit_chunk(*functions, config.fine_tuning, config.fine_tuning.steps)
+    fitted = _Fitted(encoder, config, int(style.max()) + 1, v_hat)
+    probability = np.zeros((seeds, len(style), fitted.styles), np.float32)
+    translated = None if v_hat is None else np.zeros((seeds, len(style)), int)
+    rounds = list(itertools.product(range(seeds), range(folds)))
+    for seed, fold in track(rounds, "Fitting without each fold in turn"):
+        kept, left_out = np.flatnonzero(number != fold), np.flatnonzero(number == fold)
+        learnt, asked = (
+            jax.tree.map(lambda leaf, rows=rows: leaf[rows], sentences) for rows in (kept, left_out)
+        )
+        key = jax.random.fold_in(jax.random.key(seed), fold)
+        told = fitted.tell(key, learnt, asked)
+        probability[seed, left_out] = told[0]
+        if translated is not None:
+            translated[seed, left_out] = told[1]
+    return LeftOut(probability, style, translated)
 
-    @jax.jit
-    def probabilities(params: Any, data: SentenceData) -> jax.Array:
-        embed = partial(translator.embed_hidden, params["encoder"], encoder.architecture, config)
-        return jax.nn.softmax(
-            translator.classify(params["classifier"], embed(data.hidden, data.mask), config)
+
+class _Fitted:
+    """Fits translators to some sentences and asks them for the styles of others."""
+
+    def __init__(
+        self,
+        encoder: bert_weights.Encoder,
+        config: TranslatorConfig,
+        styles: int,
+        v_hat: np.ndarray | None,
+    ):
+        self.architecture, self.config = encoder.architecture, config
+        self.styles, self.v_hat = styles, v_hat
+        initial = translator.init_fine_tuning(encoder, config, styles)
+        self._initial = translator.start_fine_tunings(initial, config)
+        functions = translator.make_fine_tuning(encoder.architecture, config)
+        self._tune = fit.make_fit_chunk(*functions, config.fine_tuning, config.fine_tuning.steps)
+        functions = translator.make_translation(config)
+        self._translate = fit.make_fit_chunk(
+            *functions, config.translation, config.translation.steps
+        )
+        self._embed = jax.jit(
+            lambda layers, data: translator.embed_hidden(
+                layers, encoder.architecture, config, data.hidden, data.mask
+            )
         )
 
-    found = np.zeros((seeds, len(style), int(style.max()) + 1), np.float32)
-    rounds = list(itertools.product(range(seeds), range(folds)))
-    for seed, fold in track(rounds, "Fine-tuning without each fold in turn"):
-        kept, left_out = np.flatnonzero(number != fold), np.flatnonzero(number == fold)
-        key = jax.random.fold_in(jax.random.key(seed), fold)
-        # A copy, because the chunk donates what it is given.
-        state = fit.init_fit(key, jax.tree.map(jnp.array, initial), config.fine_tuning)
-        state, _ = chunk(state, jax.tree.map(lambda leaf, rows=kept: leaf[rows], sentences))
-        asked = jax.tree.map(lambda leaf, rows=left_out: leaf[rows], sentences)
-        found[seed, left_out] = probabilities(state.params, asked)
-    return LeftOut(found, style)
+    def tell(
+        self, key: jax.Array, learnt: SentenceData, asked: SentenceData
+    ) -> tuple[jax.Array, jax.Array | None]:
+        """Probabilities [asked, style], and styles [asked] by the translation, if there is one."""
+        keys = jax.random.split(key, 4)
+        state = fit.init_fit(keys[0], self._initial, self.config.fine_tuning)
+        tuned = translator.average_fine_tunings(self._tune(state, learnt)[0].params)
+        embedding = self._embed(tuned["encoder"], asked)
+        probability = jax.nn.softmax(
+            translator.classify(tuned["classifier"], embedding, self.config)
+        )
+        if self.v_hat is None:
+            return probability, None
+        data = translator.prepare_translation(
+            keys[1], tuned, self.architecture, self.config, learnt, jnp.asarray(self.v_hat)
+        )
+        vae = translator.init_translation(
+            keys[2], self.architecture, self.config, self.v_hat.shape[-1]
+        )
+        state = fit.init_fit(keys[3], vae, self.config.translation)
+        vae = self._translate(state, data)[0].params
+        v_hat = translator.translate_embedding(vae, self.config, embedding)
+        return probability, task_language.nearest_style(v_hat, jnp.asarray(self.v_hat))
 
 
 def run(arguments: Arguments) -> LeftOut:
     """Loads the environment's sentences and cross-validates them.
 
     Raises:
-        UserError: there are no such environment, sentences or weights, or they do not fit.
+        UserError: there are no such environment, sentences, record or weights, or they do not fit.
     """
+    v_hat = None
+    if arguments.record is not None:
+        found = read_runs([arguments.record])[0]
+        if found["environment"] != arguments.environment:
+            raise UserError(
+                f"the record {arguments.record} is of {found['environment']}; expected one of "
+                f"{arguments.environment}"
+            )
+        v_hat = np.array(found["task_language"]["v_hat"], np.float32)
     with as_user_error(ValueError, bert_weights.EncoderWeightsError):
         env = envs.make(arguments.environment)
         instructions = load_instructions(arguments.environment, env.style_names)
@@ -137,7 +205,9 @@ def run(arguments: Arguments) -> LeftOut:
         styles = [i for i, style in enumerate(instructions.values()) for _ in style.train]
         tokens = bert_weights.tokenize(tokenizer, wordings, config.maximum_length)
         sentences = translator.prepare_sentences(encoder, config, *tokens, np.array(styles))
-    return cross_validate(encoder, config, sentences, folds=arguments.folds, seeds=arguments.seeds)
+    return cross_validate(
+        encoder, config, sentences, folds=arguments.folds, seeds=arguments.seeds, v_hat=v_hat
+    )
 
 
 def print_left_out(console: Console, arguments: Arguments, found: LeftOut) -> None:
@@ -146,19 +216,20 @@ def print_left_out(console: Console, arguments: Arguments, found: LeftOut) -> No
     instructions = load_instructions(arguments.environment, env.style_names)
     wordings = [sentence for style in instructions.values() for sentence in style.train]
     machine = ", ".join(f"{name} {value}" for name, value in describe_machine().items())
+    by = "the classifier" if found.translated is None else "the translation"
     title = f"{arguments.environment}: styles told from sentences left out"
     table = Table("style", "told right", title=title, caption=machine)
     for i, name in enumerate(env.style_names):
         table.add_row(name, f"{found.right[:, found.style == i].mean():.2f}")
     console.print(table)
     for i, wording in enumerate(wordings):
-        wrong = found.probability[~found.right[:, i], i].argmax(-1)
+        wrong = found.told[~found.right[:, i], i]
         if len(wrong):
             names = ", ".join(env.style_names[taken] for taken in sorted(set(wrong.tolist())))
             console.print(f'"{wording}" is taken for {names} ({len(wrong)} of {arguments.seeds})')
     console.print(
-        f"Told right: {found.right.mean():.3f} of {found.right.size}; mean negative "
-        f"log-likelihood {found.negative_log_likelihood:.3f}."
+        f"Told right by {by}: {found.right.mean():.3f} of {found.right.size}; the classifier's "
+        f"mean negative log-likelihood {found.negative_log_likelihood:.3f}."
     )
 
 

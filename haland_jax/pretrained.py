@@ -192,7 +192,8 @@ def read(folder: Path) -> TrainedModel:
         source = stored["about"]["encoder"] or None
         diffusion_config = filled(DiffusionConfig(), stored["diffusion"])
         vae_config = filled(PolicyVAEConfig(), stored["vae"])
-        translator_config = filled(TranslatorConfig(), stored["translator"])
+        # Bundles from before fine-tunings were averaged hold a single one, and do not say so.
+        translator_config = filled(TranslatorConfig(), {"fine_tunings": 1} | stored["translator"])
         held_out, oracles = ({"params": parts[n]} for n in ("held_out_partners", "oracles"))
         architecture = PolicyArchitecture.from_params(oracles)
         _check_environment(folder, stored, env, architecture)

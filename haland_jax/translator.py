@@ -1,11 +1,12 @@
 """The translator: from a sentence to the task language (Eq. 6, 7, Table 4, App. E.3).
 
-First the encoder and a linear classifier are fine-tuned to tell the styles apart (Eq. 7), then a
-VAE regresses the style's normalised event frequencies from the sentence embedding (Eq. 6).
-Both are fits for `haland_jax.fit`. The word embeddings and the lower layers of the encoder stay
+First the encoder and a linear classifier are fine-tuned to tell the styles apart (Eq. 7), several
+times at once, and the parameters are averaged (Wortsman et al. 2022, "Model soups"). Then a VAE
+regresses the style's normalised event frequencies from the sentence embedding (Eq. 6). Both are
+fits for `haland_jax.fit`. The word embeddings and the lower layers of the encoder stay
 as they were pre-trained, so what they return for the training sentences is computed only once.
 
-Axes: B sentences, T word pieces, W width of the encoder, D latent, U events.
+Axes: F fine-tunings, B sentences, T word pieces, W width of the encoder, U events.
 """
 
 from dataclasses import dataclass
@@ -20,6 +21,7 @@ from flax import struct
 from haland_jax.bert import Bert, BertArchitecture, Pooling, mean_pooled
 from haland_jax.bert_weights import Encoder
 from haland_jax.fit import FitConfig, LossFn, SampleFn
+from haland_jax.translation_vae import TranslationVAE, translation_loss
 
 Params = Any
 
@@ -37,6 +39,7 @@ class TranslatorConfig:
         trainable_layers: how many of the encoder's last layers are fine-tuned.
         dropout: dropout inside the fine-tuned layers, in [0, 1).
         word_piece_dropout: chance, in [0, 1), that a word piece is hidden during fine-tuning.
+        fine_tunings: how many fine-tunings, which differ in minibatches and dropout, are averaged.
         classifier_rate: how many times as fast as the encoder the classifier learns, at least 1.
         fine_tuning_batch, translation_batch: sentences in a minibatch of Eq. 7 and Eq. 6.
         views: embeddings of each sentence that the VAE is fitted to: the plain one and
@@ -53,6 +56,7 @@ class TranslatorConfig:
     trainable_layers: int = 3
     dropout: float = 0.1
     word_piece_dropout: float = 0.05
+    fine_tunings: int = 4
     classifier_rate: float = 30.0
     fine_tuning_batch: int = 24
     translation_batch: int = 80
@@ -70,7 +74,7 @@ class TranslatorConfig:
         for name in ("dropout", "word_piece_dropout"):
             if not 0.0 <= getattr(self, name) < 1.0:
                 raise ValueError(f"{name} must be in [0, 1), found {getattr(self, name)}")
-        least = dict.fromkeys(("trainable_layers", "views", "latent_dimension"), 1)
+        least = dict.fromkeys(("trainable_layers", "fine_tunings", "views", "latent_dimension"), 1)
         least |= {"fine_tuning_batch": 1, "translation_batch": 1, "classifier_rate": 1}
         for name, minimum in (least | {"maximum_length": 3, "kl_weight": 0}).items():
             if getattr(self, name) < minimum:
@@ -90,40 +94,6 @@ class TranslationData(struct.PyTreeNode):
 
     embedding: jax.Array  # float32 [B, W]
     frequencies: jax.Array  # float32 [B, U] in [0, 1]
-
-
-class TranslationVAE(nn.Module):
-    """g of Eq. 6: a sentence embedding to a Gaussian over e, and e to the frequencies."""
-
-    num_events: int
-    latent_dimension: int
-    encoder_hidden: tuple[int, ...]
-    decoder_hidden: tuple[int, ...]
-
-    def setup(self) -> None:
-        self.encoder = [nn.Dense(size) for size in self.encoder_hidden]
-        self.posterior = nn.Dense(2 * self.latent_dimension)
-        self.decoder = [nn.Dense(size) for size in self.decoder_hidden]
-        self.frequencies = nn.Dense(self.num_events)
-
-    def __call__(self, embedding: jax.Array) -> jax.Array:
-        """The deterministic translation of [B, W]: the posterior mean decoded, [B, U]."""
-        return self.decode(self.encode(embedding)[0])
-
-    def encode(self, embedding: jax.Array) -> tuple[jax.Array, jax.Array]:
-        """Mean and log-variance of e, each [B, D], from [B, W]."""
-        hidden = embedding
-        for layer in self.encoder:
-            hidden = nn.relu(layer(hidden))
-        mean, log_variance = jnp.split(self.posterior(hidden), 2, axis=-1)
-        return mean, log_variance
-
-    def decode(self, latent: jax.Array) -> jax.Array:
-        """Normalised frequencies in [0, 1], [B, U], from e [B, D]."""
-        hidden = latent
-        for layer in self.decoder:
-            hidden = nn.relu(layer(hidden))
-        return nn.sigmoid(self.frequencies(hidden))
 
 
 class Translator(struct.PyTreeNode):
@@ -226,22 +196,45 @@ def init_fine_tuning(encoder: Encoder, config: TranslatorConfig, num_styles: int
     }
 
 
+def start_fine_tunings(params: Params, config: TranslatorConfig) -> Params:
+    """What `init_fine_tuning` returned, once for each fine-tuning: leaves [F, ...]."""
+    return jax.tree.map(lambda leaf: jnp.stack([leaf] * config.fine_tunings), params)
+
+
+def average_fine_tunings(params: Params) -> Params:
+    """The mean of fine-tunings with leaves [F, ...]: one encoder and one classifier.
+
+    They began at the same parameters and went a short way, so that their mean is as good at the
+    sentences that they learnt from as each of them, and better at other sentences.
+    """
+    return jax.tree.map(lambda leaf: leaf.mean(0), params)
+
+
 def make_fine_tuning(
     architecture: BertArchitecture, config: TranslatorConfig
 ) -> tuple[LossFn, SampleFn]:
-    """Loss and minibatches of Eq. 7: cross-entropy of the style, mean over B."""
+    """Loss and minibatches of Eq. 7: cross-entropy of the style, mean over B and F.
+
+    The parameters are those of `start_fine_tunings`, the leaves of a minibatch [F, B, ...].
+    """
 
     def sample_fn(key: jax.Array, data: SentenceData) -> SentenceData:
-        return _minibatch(key, data, config.fine_tuning_batch)
+        keys = jax.random.split(key, config.fine_tunings)
+        return jax.vmap(lambda one: _minibatch(one, data, config.fine_tuning_batch))(keys)
 
-    def loss_fn(params: Params, key: jax.Array, batch: SentenceData):
+    def loss_of_one(params: Params, key: jax.Array, batch: SentenceData):
         hide_key, dropout_key = jax.random.split(key)
         mask = hide_word_pieces(hide_key, batch.mask, config.word_piece_dropout)
         inputs = (params["encoder"], architecture, config, batch.hidden, mask)
         embedding = embed_hidden(*inputs, dropout_key=dropout_key if config.dropout else None)
         logits = classify(params["classifier"], embedding, config)
         accuracy = (logits.argmax(-1) == batch.style).mean()
-        return classification_loss(logits, batch.style), {"accuracy": accuracy}
+        return classification_loss(logits, batch.style), accuracy
+
+    def loss_fn(params: Params, key: jax.Array, batch: SentenceData):
+        keys = jax.random.split(key, config.fine_tunings)
+        loss, accuracy = jax.vmap(loss_of_one)(params, keys, batch)
+        return loss.mean(), {"accuracy": accuracy.mean()}
 
     return loss_fn, sample_fn
 
@@ -273,7 +266,7 @@ def prepare_translation(
 
     Args:
         key: for hiding word pieces in all views but the first.
-        params: fine-tuned parameters of Eq. 7.
+        params: parameters of Eq. 7, as `average_fine_tunings` returns them.
         architecture, config: the encoder's and the translator's.
         sentences: training sentences, B of them.
         frequencies: [style, U], the normalised event frequencies of each style, in [0, 1].
@@ -332,27 +325,10 @@ def make_translation(config: TranslatorConfig) -> tuple[LossFn, SampleFn]:
     return loss_fn, sample_fn
 
 
-def translation_loss(
-    translated: jax.Array,
-    frequencies: jax.Array,
-    mean: jax.Array,
-    log_variance: jax.Array,
-    kl_weight: float,
-) -> tuple[jax.Array, dict[str, jax.Array]]:
-    """Eq. 6: squared error (sum over U) + weight x KL to N(0, I) (sum over D), mean over B.
-
-    `translated` and `frequencies` are [B, U], the posterior's `mean` and `log_variance` [B, D];
-    the paper's formula has `kl_weight` 1.
-    """
-    squared_error = jnp.square(translated - frequencies).sum(-1).mean()
-    kl = 0.5 * (jnp.square(mean) + jnp.exp(log_variance) - 1.0 - log_variance).sum(-1).mean()
-    return squared_error + kl_weight * kl, {"squared_error": squared_error, "kl": kl}
-
-
 def assemble_translator(
     encoder: Encoder, config: TranslatorConfig, fine_tuned: Params, vae: Params
 ) -> Translator:
-    """Join the pre-trained encoder with what the two fits returned."""
+    """Join the pre-trained encoder with the averaged fine-tunings and the translation's VAE."""
     merged = {**encoder.params["params"], **fine_tuned["encoder"]}
     params = {"encoder": merged, "classifier": fine_tuned["classifier"], "vae": vae}
     return Translator(params=params, architecture=encoder.architecture, config=config)
@@ -373,9 +349,14 @@ def translate(
     variables = {"params": params["encoder"]}
     hidden = frozen_hidden(variables, architecture, config, token_ids, mask)
     embedding = embed_hidden(params["encoder"], architecture, config, hidden, mask)
-    vae: Any = _vae(config, num_events=params["vae"]["frequencies"]["bias"].shape[0])
-    translated = vae.apply({"params": params["vae"]}, embedding)
+    translated = translate_embedding(params["vae"], config, embedding)
     return translated, classify(params["classifier"], embedding, config)
+
+
+def translate_embedding(vae: Params, config: TranslatorConfig, embedding: jax.Array) -> jax.Array:
+    """Sentence embeddings [B, W] to normalised frequencies [B, U], deterministic."""
+    module: Any = _vae(config, num_events=vae["frequencies"]["bias"].shape[0])
+    return module.apply({"params": vae}, embedding)
 
 
 def _vae(config: TranslatorConfig, num_events: int) -> TranslationVAE:

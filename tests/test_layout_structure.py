@@ -37,6 +37,7 @@ ORDER = (
     "cgan",
     "bert",
     "bert_weights",
+    "translation_vae",
     "translator",
     "deployment",
     "compact",

@@ -1,6 +1,7 @@
 """`experiments.sentences`: a style told from wordings that were left out of the fine-tuning."""
 
 import dataclasses
+from pathlib import Path
 
 import jax.numpy as jnp
 import numpy as np
@@ -10,7 +11,7 @@ from experiments import sentences
 from experiments.errors import UserError
 from haland_jax.fit import FitConfig
 from haland_jax.translator import SentenceData, prepare_sentences
-from tests.test_translator import CONFIG, small_encoder, small_sentences
+from tests.test_translator import CONFIG, FREQUENCIES, small_encoder, small_sentences
 
 QUICK = dataclasses.replace(CONFIG, fine_tuning=FitConfig(learning_rate=1e-2, steps=60))
 
@@ -25,6 +26,23 @@ def test_a_style_that_one_word_gives_away_is_told_from_sentences_left_out():
     np.testing.assert_allclose(found.probability.sum(-1), 1.0, rtol=1e-5)
     # Nine sentences for an encoder that knows no language: it errs, but is far above 1 in 3.
     assert found.right.mean() >= 0.6
+
+
+def test_sentences_left_out_are_translated_too():
+    translated = sentences.cross_validate(
+        small_encoder(), QUICK, prepared(), folds=4, seeds=1, v_hat=FREQUENCIES
+    )
+    plain = sentences.cross_validate(small_encoder(), QUICK, prepared(), folds=4, seeds=1)
+    np.testing.assert_allclose(translated.probability, plain.probability, atol=1e-5)
+    np.testing.assert_array_equal(translated.told, translated.translated)
+    assert translated.right.mean() >= 0.6
+    assert plain.translated is None
+
+
+def test_a_record_of_another_environment_is_refused():
+    record = Path(__file__).parents[1] / "docs/comparisons/lbf/spread"
+    with pytest.raises(UserError, match="is of lbf/spread; expected one of overcooked/crossway"):
+        sentences.run(sentences.Arguments("overcooked/crossway", record=record))
 
 
 def test_labels_without_meaning_are_told_no_better_than_by_chance():
@@ -60,7 +78,9 @@ def test_an_unknown_environment_is_refused():
 
 def test_the_packaged_sentences_are_cross_validated(capsys):
     short = dataclasses.replace(
-        sentences.TranslatorConfig(), fine_tuning=FitConfig(learning_rate=1e-4, steps=24)
+        sentences.TranslatorConfig(),
+        fine_tunings=1,
+        fine_tuning=FitConfig(learning_rate=1e-4, steps=24),
     )
     arguments = sentences.Arguments("assistive/jaco", folds=2, translator=short)
     found = sentences.run(arguments)
@@ -68,6 +88,6 @@ def test_the_packaged_sentences_are_cross_validated(capsys):
     assert found.right.mean() > 0.5  # by chance 0.125
     sentences.print_left_out(sentences.Console(width=120), arguments, found)
     printed = capsys.readouterr().out
-    assert f"Told right: {found.right.mean():.3f} of 160" in printed
+    assert f"Told right by the classifier: {found.right.mean():.3f} of 160" in printed
     assert "scratch_upper_arm" in printed
     assert printed.count("is taken for") == (~found.right).sum()

@@ -10,10 +10,12 @@ import pytest
 from haland_jax.bert import Bert, BertArchitecture, mean_pooled
 from haland_jax.bert_weights import Encoder, load_tokenizer, tokenize
 from haland_jax.fit import FitConfig, init_fit, make_fit_chunk
+from haland_jax.translation_vae import translation_loss
 from haland_jax.translator import (
     SentenceData,
     TranslatorConfig,
     assemble_translator,
+    average_fine_tunings,
     classification_loss,
     classify,
     embed_hidden,
@@ -24,8 +26,8 @@ from haland_jax.translator import (
     make_translation,
     prepare_sentences,
     prepare_translation,
+    start_fine_tunings,
     translate,
-    translation_loss,
 )
 
 ARCHITECTURE = BertArchitecture(
@@ -33,6 +35,7 @@ ARCHITECTURE = BertArchitecture(
 )
 CONFIG = TranslatorConfig(
     trainable_layers=2,
+    fine_tunings=2,
     classifier_rate=2.0,
     fine_tuning_batch=6,
     translation_batch=12,
@@ -74,12 +77,13 @@ def translator():
     encoder = small_encoder()
     token_ids, mask, style = small_sentences()
     sentences = prepare_sentences(encoder, CONFIG, token_ids, mask, style)
-    tuned, metrics = fitted(
+    fine_tunings, metrics = fitted(
         make_fine_tuning(ARCHITECTURE, CONFIG),
         CONFIG.fine_tuning,
-        init_fine_tuning(encoder, CONFIG, 3),
+        start_fine_tunings(init_fine_tuning(encoder, CONFIG, 3), CONFIG),
         sentences,
     )
+    tuned = average_fine_tunings(fine_tunings)
     assert metrics["loss"].shape == (CONFIG.fine_tuning.steps,)
     data = prepare_translation(
         jax.random.key(1), tuned, ARCHITECTURE, CONFIG, sentences, FREQUENCIES
@@ -112,15 +116,41 @@ def test_fine_tuning_loss_is_the_cross_entropy_of_the_pooled_embedding():
     kernel = 0.1 * np.random.default_rng(0).normal(size=params["classifier"]["kernel"].shape)
     params["classifier"] = {"kernel": jnp.asarray(kernel), "bias": jnp.array([0.1, 0.0, -0.1])}
     data = prepare_sentences(encoder, config, token_ids, mask, style)
-    loss, metrics = make_fine_tuning(ARCHITECTURE, config)[0](params, jax.random.key(0), data)
+    loss_fn, _ = make_fine_tuning(ARCHITECTURE, config)
+    # Two fine-tunings: one has the sentences' styles, the other the next ones.
+    batch = jax.tree.map(lambda leaf: jnp.stack([leaf, leaf]), data)
+    batch = batch.replace(style=jnp.stack([data.style, (data.style + 1) % 3]))
+    loss, metrics = loss_fn(start_fine_tunings(params, config), jax.random.key(0), batch)
     # The whole encoder in one piece, pooled and classified in NumPy.
     hidden = np.asarray(Bert(ARCHITECTURE).apply(encoder.params, token_ids, mask).hidden)
     embedding = np.stack([row[used].mean(0) for row, used in zip(hidden, mask, strict=True)])
     logits = config.classifier_rate * (embedding @ kernel + np.array([0.1, 0.0, -0.1]))
     normaliser = np.log(np.exp(logits).sum(-1))
-    expected = (normaliser - logits[np.arange(12), style]).mean()
+    asked = np.stack([style, (style + 1) % 3])
+    expected = (normaliser - logits[np.arange(12), asked]).mean()
     np.testing.assert_allclose(loss, expected, rtol=1e-4)
-    np.testing.assert_allclose(metrics["accuracy"], (logits.argmax(-1) == style).mean())
+    np.testing.assert_allclose(metrics["accuracy"], (logits.argmax(-1) == asked).mean())
+
+
+def test_fine_tunings_begin_alike_and_are_averaged():
+    params = {"encoder": jnp.array([1.0, 2.0]), "classifier": jnp.array(3.0)}
+    begun = start_fine_tunings(params, dataclasses.replace(CONFIG, fine_tunings=3))
+    np.testing.assert_array_equal(begun["encoder"], [[1.0, 2.0]] * 3)
+    moved = begun | {"encoder": begun["encoder"] + jnp.array([[0.0], [1.0], [5.0]])}
+    average = average_fine_tunings(moved)
+    np.testing.assert_allclose(average["encoder"], [3.0, 4.0])
+    np.testing.assert_allclose(average["classifier"], 3.0)
+
+
+def test_fine_tunings_learn_from_different_minibatches():
+    encoder = small_encoder()
+    sentences = prepare_sentences(encoder, CONFIG, *small_sentences())
+    initial = start_fine_tunings(init_fine_tuning(encoder, CONFIG, 3), CONFIG)
+    few = FitConfig(learning_rate=1e-2, steps=2)
+    params, _ = fitted(make_fine_tuning(ARCHITECTURE, CONFIG), few, initial, sentences)
+    kernels = np.asarray(params["classifier"]["kernel"])
+    assert kernels.shape == (2, 16, 3)
+    assert np.abs(kernels[0] - kernels[1]).max() > 1e-3
 
 
 # Equation 6.
@@ -169,7 +199,9 @@ def test_a_minibatch_holds_different_sentences_with_their_own_styles():
     rows = jnp.arange(12)
     data = SentenceData(hidden=rows * 1.0, mask=rows >= 0, style=rows)
     batch = make_fine_tuning(ARCHITECTURE, CONFIG)[1](jax.random.key(0), data)
-    assert len(set(batch.style.tolist())) == CONFIG.fine_tuning_batch
+    for style in batch.style:  # of one fine-tuning
+        assert len(set(style.tolist())) == CONFIG.fine_tuning_batch
+    assert set(batch.style[0].tolist()) != set(batch.style[1].tolist())
     np.testing.assert_array_equal(batch.hidden, batch.style)
 
 

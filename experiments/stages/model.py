@@ -235,16 +235,18 @@ def fit_translator(run: Run, task: StageProgress) -> dict[str, Any]:
     encoder, _ = load_pretrained(run)
     prepared = prepare_instructions(run, encoder)
     keys = jax.random.split(run.key("translator"), 4)
-    tuned, first = _fit_part(
+    initial = translator.init_fine_tuning(encoder, config, len(run.env.style_names))
+    fine_tunings, first = _fit_part(
         "fine-tuning",
         config.fine_tuning,
         translator.make_fine_tuning(encoder.architecture, config),
-        translator.init_fine_tuning(encoder, config, len(run.env.style_names)),
+        translator.start_fine_tunings(initial, config),
         keys[0],
         prepared,
         Saver(run.path("translator", "unfinished_fine_tuning")),
         task,
     )
+    tuned = translator.average_fine_tunings(fine_tunings)
     vae, second = fit_translation(
         keys[1:],
         config,
