@@ -2,9 +2,9 @@
 
 import dataclasses
 from collections.abc import Callable
-from typing import Any
+from typing import Any, TypeVar
 
-from experiments.adaptations import ADAPTATIONS, LONG_COMPRESSION, Adaptation
+from experiments.adaptations import ADAPTATIONS, LONG_COMPRESSION, Adaptation, PresetChanges
 from haland_jax.diffusion import DiffusionConfig
 from haland_jax.fit import FitConfig
 from haland_jax.partners import PartnersConfig, best_response_config, oracle_config
@@ -13,6 +13,7 @@ from haland_jax.ppo import PPOConfig
 from haland_jax.translator import TranslatorConfig
 from haland_jax.universal import UniversalConfig, universal_config
 
+Settings = TypeVar("Settings")
 DEFAULT_ENVIRONMENT = "overcooked/diverse_coordination"
 
 
@@ -108,17 +109,20 @@ def _adapted(config: RunConfig) -> RunConfig:
         steps = int(length * training.total_steps)
         return dataclasses.replace(training, total_steps=steps, **change.training, **more)
 
+    only = change.presets.get(config.preset, PresetChanges())
     partners, universal, compression = config.partners, config.universal, config.compression
     joint = changed(partners.joint, change.length, **change.joint)
-    steps = change.joint_steps.get(config.preset, joint.total_steps)
-    joint = dataclasses.replace(joint, total_steps=steps)
+    joint = _with(joint, total_steps=only.joint_steps)
+    training = _with(
+        universal.training, num_envs=only.universal_games, total_steps=only.universal_start
+    )
+    partners = _with(
+        partners,
+        universal_start=None if only.universal_start is None else True,
+        told_start=only.told_start,
+        spare_seeds=only.spare_seeds,
+    )
     normalised = change.training.get("normalise", compression.vae.normalised)
-    games = change.universal_games.get(config.preset, universal.training.num_envs)
-    training = dataclasses.replace(universal.training, num_envs=games)
-    if config.preset in change.universal_start:
-        partners = dataclasses.replace(partners, universal_start=True, told_start=change.told_start)
-        steps = change.universal_start[config.preset]
-        training = dataclasses.replace(training, total_steps=steps)
     return dataclasses.replace(
         config,
         max_steps=min(config.max_steps, change.max_steps),
@@ -127,16 +131,20 @@ def _adapted(config: RunConfig) -> RunConfig:
             joint=joint,
             refit=changed(partners.refit, change.refit_length, **change.refit),
             oracle=changed(partners.oracle),
-            spare_seeds=change.spare_seeds.get(config.preset, partners.spare_seeds),
             **change.partners,
         ),
         compression=dataclasses.replace(
-            compression,
+            _with(compression, fit=only.compression),
             vae=dataclasses.replace(compression.vae, normalised=normalised),
-            fit=change.compression.get(config.preset, compression.fit),
         ),
         universal=dataclasses.replace(universal, training=changed(training, **change.universal)),
     )
+
+
+def _with(settings: Settings, **changes: Any) -> Settings:
+    """A copy of a dataclass with those changes that are not None."""
+    given = {name: value for name, value in changes.items() if value is not None}
+    return dataclasses.replace(settings, **given)  # pyright: ignore[reportArgumentType]
 
 
 _DIFFUSION = DiffusionConfig(clip=8.0, frequency_jitter=0.08)
