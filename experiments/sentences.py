@@ -41,6 +41,9 @@ class Arguments:
     """Name of the environment, such as assistive/jaco."""
     folds: int = 5
     """Parts that the sentences of a style are dealt to."""
+    consecutive: bool = False
+    """Deal consecutive sentences to a fold, not every fifth: an author's are, so that with four
+    folds the styles are told from an author's wordings left out."""
     seeds: int = 1
     """Repetitions, with other random minibatches."""
     encoder: Annotated[str, tyro.conf.arg(metavar="FOLDER|NAME")] = ""
@@ -91,6 +94,7 @@ def cross_validate(
     folds: int,
     seeds: int,
     v_hat: np.ndarray | None = None,
+    consecutive: bool = False,
 ) -> LeftOut:
     """Fits the translator without each fold in turn.
 
@@ -101,6 +105,7 @@ def cross_validate(
         folds: a style's sentence i is left out with fold i modulo `folds`.
         seeds: repetitions.
         v_hat: task language of each style, [style, U]; without it BERT alone is fine-tuned.
+        consecutive: whether a style's n sentences are left out by n / `folds` consecutive ones.
 
     Raises:
         UserError: fewer than two folds, more than a style has sentences, or no repetition.
@@ -111,7 +116,8 @@ def cross_validate(
         raise UserError(f"folds is {folds}; expected 2 to {fewest}, the sentences of a style")
     if seeds < 1:
         raise UserError(f"seeds is {seeds}; expected at least 1")
-    number = np.array([np.sum(style[:i] == style[i]) for i in range(len(style))]) % folds
+    place = np.array([np.sum(style[:i] == style[i]) for i in range(len(style))])
+    number = place * folds // np.bincount(style)[style] if consecutive else place % folds
     fitted = _Fitted(encoder, config, int(style.max()) + 1, v_hat)
     probability = np.zeros((seeds, len(style), fitted.styles), np.float32)
     translated = None if v_hat is None else np.zeros((seeds, len(style)), int)
@@ -206,7 +212,13 @@ def run(arguments: Arguments) -> LeftOut:
         tokens = bert_weights.tokenize(tokenizer, wordings, config.maximum_length)
         sentences = translator.prepare_sentences(encoder, config, *tokens, np.array(styles))
     return cross_validate(
-        encoder, config, sentences, folds=arguments.folds, seeds=arguments.seeds, v_hat=v_hat
+        encoder,
+        config,
+        sentences,
+        folds=arguments.folds,
+        seeds=arguments.seeds,
+        v_hat=v_hat,
+        consecutive=arguments.consecutive,
     )
 
 

@@ -34,8 +34,6 @@ STYLES |= {
         "drink_right",
     )
 }
-TRAINING_SENTENCES = {"overcooked/crossway": 30}
-"""Of a style, where they are not twenty."""
 NUMBERS = ("one", "two", "three", "four", "five", "six", "seven", "eight")
 ORDINALS = ("first", "second", "third", "fourth", "fifth", "sixth", "seventh", "eighth")
 SMALL = ("smallest", "lightest", "lowest")
@@ -54,7 +52,7 @@ def test_every_style_has_as_many_training_and_test_sentences(environment):
     instructions = load_instructions(environment, STYLES[environment])
     assert tuple(instructions) == STYLES[environment]
     for style, sentences in instructions.items():
-        assert len(sentences.train) == TRAINING_SENTENCES.get(environment, 20), style
+        assert len(sentences.train) == 40, style
         assert len(sentences.test) == 4, style
 
 

@@ -3,6 +3,7 @@
 import dataclasses
 from pathlib import Path
 
+import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
@@ -37,6 +38,23 @@ def test_sentences_left_out_are_translated_too():
     np.testing.assert_array_equal(translated.told, translated.translated)
     assert translated.right.mean() >= 0.6
     assert plain.translated is None
+
+
+def test_whole_authors_may_be_left_out():
+    # Of each style the first two sentences say it with another word than the others do.
+    told = prepared()
+    hidden = jnp.zeros_like(told.hidden)
+    author = (jnp.arange(12) // 6)[:, None, None]
+    says = jax.nn.one_hot(told.style, 3)[:, None] * jnp.where(author == 0, 1.0, -1.0)
+    told = told.replace(hidden=hidden.at[:, 1:4, :3].add(5.0 * says))
+    dealt, by_author = (
+        sentences.cross_validate(
+            small_encoder(), QUICK, told, folds=2, seeds=1, consecutive=consecutive
+        )
+        for consecutive in (False, True)
+    )
+    assert dealt.right.mean() == 1.0
+    assert by_author.right.mean() < 0.7
 
 
 def test_a_record_of_another_environment_is_refused():
