@@ -102,10 +102,10 @@ def test_the_packaged_sentences_are_cross_validated(capsys):
     )
     arguments = sentences.Arguments("assistive/jaco", folds=2, translator=short)
     found = sentences.run(arguments)
-    assert found.right.shape == (1, 160)
+    assert found.right.shape == (1, 320)
     assert found.right.mean() > 0.5  # by chance 0.125
     sentences.print_left_out(sentences.Console(width=120), arguments, found)
     printed = capsys.readouterr().out
-    assert f"Told right by the classifier: {found.right.mean():.3f} of 160" in printed
+    assert f"Told right by the classifier: {found.right.mean():.3f} of 320" in printed
     assert "scratch_upper_arm" in printed
     assert printed.count("is taken for") == (~found.right).sum()
