@@ -125,6 +125,8 @@ def test_the_records_of_the_repository_fit_this_version(record_folder):
         assert config.universal.training.guidance == 0
     if "universal_rate" not in texts["config"]["partners"]:
         assert config.partners.universal_refit == config.partners.refit
+    if "fine_tunings" not in texts["config"]["translator"]:
+        assert config.translator.fine_tunings == 1
 
 
 def test_half_precision_is_for_policies_that_fit_into_it():
