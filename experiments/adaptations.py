@@ -20,7 +20,7 @@ class PresetChanges:
         compression: the policy VAE's fit, where the preset's is too short.
         universal_games: games in parallel of the universal egos, where those of the preset
             cannot be shared by the partners in equal parts.
-        universal_start: steps of the universal egos, where best responses start from them too
+        universal_start_steps: steps of the universal egos, where best responses start from them too
             and the preset does not foresee it.
         told_start: whether they start from the told one alone (`PartnersConfig.told_start`).
     """
@@ -29,8 +29,12 @@ class PresetChanges:
     spare_seeds: int | None = None
     compression: FitConfig | None = None
     universal_games: int | None = None
-    universal_start: int | None = None
+    universal_start_steps: int | None = None
     told_start: bool | None = None
+
+    def __post_init__(self) -> None:
+        if self.told_start and self.universal_start_steps is None:
+            raise ValueError("told_start needs universal_start_steps, which is None")
 
 
 @dataclasses.dataclass(frozen=True)
@@ -62,7 +66,7 @@ class Adaptation:
 
 
 _TOLD_START = PresetChanges(
-    compression=LONG_COMPRESSION, universal_start=40_000_000, told_start=True
+    compression=LONG_COMPRESSION, universal_start_steps=40_000_000, told_start=True
 )
 
 ADAPTATIONS = {
@@ -94,7 +98,7 @@ ADAPTATIONS = {
         training={"discount": 0.995},
         presets={
             "quick": dataclasses.replace(
-                _TOLD_START, joint_steps=1_800_000, spare_seeds=2, universal_start=160_000_000
+                _TOLD_START, joint_steps=1_800_000, spare_seeds=2, universal_start_steps=160_000_000
             ),
             "overnight": PresetChanges(universal_games=256),
             "paper": PresetChanges(universal_games=384),
@@ -107,7 +111,9 @@ ADAPTATIONS = {
         max_steps=50,
         length=0.4,
         training={"reward_scale": 2.0, "confined_until": 0.0},
-        presets={"quick": PresetChanges(compression=LONG_COMPRESSION, universal_start=40_000_000)},
+        presets={
+            "quick": PresetChanges(compression=LONG_COMPRESSION, universal_start_steps=40_000_000)
+        },
     ),
     # Speeds of joints, and observations of several units. At the mouth all pairs succeed within
     # 0.4 M steps; scratching and bathing take longest. High rates ruin egos that are good already.

@@ -109,18 +109,20 @@ def _adapted(config: RunConfig) -> RunConfig:
         steps = int(length * training.total_steps)
         return dataclasses.replace(training, total_steps=steps, **change.training, **more)
 
-    only = change.presets.get(config.preset, PresetChanges())
+    of_preset = change.presets.get(config.preset, PresetChanges())
     partners, universal, compression = config.partners, config.universal, config.compression
     joint = changed(partners.joint, change.length, **change.joint)
-    joint = _with(joint, total_steps=only.joint_steps)
+    joint = _with(joint, total_steps=of_preset.joint_steps)
     training = _with(
-        universal.training, num_envs=only.universal_games, total_steps=only.universal_start
+        universal.training,
+        num_envs=of_preset.universal_games,
+        total_steps=of_preset.universal_start_steps,
     )
     partners = _with(
         partners,
-        universal_start=None if only.universal_start is None else True,
-        told_start=only.told_start,
-        spare_seeds=only.spare_seeds,
+        universal_start=None if of_preset.universal_start_steps is None else True,
+        told_start=of_preset.told_start,
+        spare_seeds=of_preset.spare_seeds,
     )
     normalised = change.training.get("normalise", compression.vae.normalised)
     return dataclasses.replace(
@@ -134,7 +136,7 @@ def _adapted(config: RunConfig) -> RunConfig:
             **change.partners,
         ),
         compression=dataclasses.replace(
-            _with(compression, fit=only.compression),
+            _with(compression, fit=of_preset.compression),
             vae=dataclasses.replace(compression.vae, normalised=normalised),
         ),
         universal=dataclasses.replace(universal, training=changed(training, **change.universal)),

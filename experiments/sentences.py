@@ -7,7 +7,9 @@
 The sentences of each style are dealt to folds. BERT is fine-tuned as in a run (Eq. 7) on all folds
 but one and asked for the styles of that one, each fold in turn. With the task language of a record
 or a run, the translation (Eq. 6) is fitted and asked too. So settings of the translator can be
-chosen, and sentences written, without a look at the test sentences.
+chosen, and sentences written, without a look at the test sentences. The files in
+envs/instructions say how many sentences each author wrote, one after the other; with `--authors`
+each author is left out in turn, which says how a stranger will be understood.
 """
 
 import dataclasses
@@ -41,11 +43,10 @@ class Arguments:
     """Name of the environment, such as assistive/jaco."""
     folds: int = 5
     """Parts that the sentences of a style are dealt to."""
-    consecutive: bool = False
-    """Deal consecutive sentences to a fold, not every fifth: an author's are, so that with four
-    folds the styles are told from an author's wordings left out."""
+    authors: tuple[int, ...] = ()
+    """Leave out authors in turn instead: sentences of a style by each, such as 10 10 20."""
     seeds: int = 1
-    """Repetitions, with other random minibatches."""
+    """Repetitions, with other random minibatches, dropout and translations."""
     encoder: Annotated[str, tyro.conf.arg(metavar="FOLDER|NAME")] = ""
     """A BERT checkpoint; the packaged one by default."""
     record: Annotated[Path | None, tyro.conf.arg(metavar="FOLDER")] = None
@@ -80,6 +81,11 @@ class LeftOut:
         return self.told == self.style
 
     @property
+    def classified_right(self) -> np.ndarray:
+        """bool [seed, sentence]: is the true style the classifier's most probable one?"""
+        return self.probability.argmax(-1) == self.style
+
+    @property
     def negative_log_likelihood(self) -> float:
         """Of the true styles, mean over seeds and sentences."""
         of_true = self.probability[:, np.arange(len(self.style)), self.style]
@@ -94,7 +100,7 @@ def cross_validate(
     folds: int,
     seeds: int,
     v_hat: np.ndarray | None = None,
-    consecutive: bool = False,
+    authors: tuple[int, ...] = (),
 ) -> LeftOut:
     """Fits the translator without each fold in turn.
 
@@ -105,19 +111,27 @@ def cross_validate(
         folds: a style's sentence i is left out with fold i modulo `folds`.
         seeds: repetitions.
         v_hat: task language of each style, [style, U]; without it BERT alone is fine-tuned.
-        consecutive: whether a style's n sentences are left out by n / `folds` consecutive ones.
+        authors: consecutive sentences of a style by each author, who then are the folds.
 
     Raises:
-        UserError: fewer than two folds, more than a style has sentences, or no repetition.
+        UserError: fewer than two folds, more than a style has sentences, authors who have not
+            written all of them, or no repetition.
     """
     style = np.asarray(sentences.style)
     fewest = int(np.bincount(style).min())
+    if authors:
+        folds = len(authors)
     if not 2 <= folds <= fewest:
-        raise UserError(f"folds is {folds}; expected 2 to {fewest}, the sentences of a style")
+        what = "authors" if authors else "folds"
+        raise UserError(f"{what} is {folds}; expected 2 to {fewest}, the sentences of a style")
+    if authors and set(np.bincount(style)) != {sum(authors)}:
+        raise UserError(
+            f"authors wrote {sum(authors)} sentences of a style; expected {fewest}, which it has"
+        )
     if seeds < 1:
         raise UserError(f"seeds is {seeds}; expected at least 1")
     place = np.array([np.sum(style[:i] == style[i]) for i in range(len(style))])
-    number = place * folds // np.bincount(style)[style] if consecutive else place % folds
+    number = np.repeat(np.arange(folds), authors)[place] if authors else place % folds
     fitted = _Fitted(encoder, config, int(style.max()) + 1, v_hat)
     probability = np.zeros((seeds, len(style), fitted.styles), np.float32)
     translated = None if v_hat is None else np.zeros((seeds, len(style)), int)
@@ -128,10 +142,9 @@ def cross_validate(
             jax.tree.map(lambda leaf, rows=rows: leaf[rows], sentences) for rows in (kept, left_out)
         )
         key = jax.random.fold_in(jax.random.key(seed), fold)
-        told = fitted.tell(key, learnt, asked)
-        probability[seed, left_out] = told[0]
+        probability[seed, left_out], styles = fitted.tell(key, learnt, asked)
         if translated is not None:
-            translated[seed, left_out] = told[1]
+            translated[seed, left_out] = styles
     return LeftOut(probability, style, translated)
 
 
@@ -192,17 +205,11 @@ def run(arguments: Arguments) -> LeftOut:
     Raises:
         UserError: there are no such environment, sentences, record or weights, or they do not fit.
     """
-    v_hat = None
-    if arguments.record is not None:
-        found = read_runs([arguments.record])[0]
-        if found["environment"] != arguments.environment:
-            raise UserError(
-                f"the record {arguments.record} is of {found['environment']}; expected one of "
-                f"{arguments.environment}"
-            )
-        v_hat = np.array(found["task_language"]["v_hat"], np.float32)
     with as_user_error(ValueError, bert_weights.EncoderWeightsError):
         env = envs.make(arguments.environment)
+        v_hat = None
+        if arguments.record is not None:
+            v_hat = _task_language(arguments.record, arguments.environment, env.style_names)
         instructions = load_instructions(arguments.environment, env.style_names)
         encoder = bert_weights.load_encoder(arguments.encoder or None)
         tokenizer = bert_weights.load_tokenizer(arguments.encoder or None)
@@ -218,8 +225,19 @@ def run(arguments: Arguments) -> LeftOut:
         folds=arguments.folds,
         seeds=arguments.seeds,
         v_hat=v_hat,
-        consecutive=arguments.consecutive,
+        authors=arguments.authors,
     )
+
+
+def _task_language(record: Path, environment: str, style_names: tuple[str, ...]) -> np.ndarray:
+    """The record's, float32 [style, U]."""
+    found = read_runs([record])[0]
+    if found["environment"] != environment or found["styles"] != list(style_names):
+        raise UserError(
+            f"the record {record} is of {found['environment']} with the styles "
+            f"{', '.join(found['styles'])}; expected {environment} and {', '.join(style_names)}"
+        )
+    return np.array(found["task_language"]["v_hat"], np.float32)
 
 
 def print_left_out(console: Console, arguments: Arguments, found: LeftOut) -> None:
@@ -228,8 +246,8 @@ def print_left_out(console: Console, arguments: Arguments, found: LeftOut) -> No
     instructions = load_instructions(arguments.environment, env.style_names)
     wordings = [sentence for style in instructions.values() for sentence in style.train]
     machine = ", ".join(f"{name} {value}" for name, value in describe_machine().items())
-    by = "the classifier" if found.translated is None else "the translation"
-    title = f"{arguments.environment}: styles told from sentences left out"
+    by = "classifier" if found.translated is None else "translation"
+    title = f"{arguments.environment}: styles told by the {by} from sentences left out"
     table = Table("style", "told right", title=title, caption=machine)
     for i, name in enumerate(env.style_names):
         table.add_row(name, f"{found.right[:, found.style == i].mean():.2f}")
@@ -239,9 +257,11 @@ def print_left_out(console: Console, arguments: Arguments, found: LeftOut) -> No
         if len(wrong):
             names = ", ".join(env.style_names[taken] for taken in sorted(set(wrong.tolist())))
             console.print(f'"{wording}" is taken for {names} ({len(wrong)} of {arguments.seeds})')
+    if found.translated is not None:
+        console.print(f"Told right by the translation: {found.right.mean():.3f}.")
     console.print(
-        f"Told right by {by}: {found.right.mean():.3f} of {found.right.size}; the classifier's "
-        f"mean negative log-likelihood {found.negative_log_likelihood:.3f}."
+        f"Told right by the classifier: {found.classified_right.mean():.3f} of "
+        f"{found.right.size}; mean negative log-likelihood {found.negative_log_likelihood:.3f}."
     )
 
 

@@ -39,7 +39,8 @@ class TranslatorConfig:
         trainable_layers: how many of the encoder's last layers are fine-tuned.
         dropout: dropout inside the fine-tuned layers, in [0, 1).
         word_piece_dropout: chance, in [0, 1), that a word piece is hidden during fine-tuning.
-        fine_tunings: how many fine-tunings, which differ in minibatches and dropout, are averaged.
+        fine_tunings: how many fine-tunings, which differ in minibatches and dropout, are averaged;
+            time and memory of the fit grow with it, the fine-tuned translator's do not.
         classifier_rate: how many times as fast as the encoder the classifier learns, at least 1.
         fine_tuning_batch, translation_batch: sentences in a minibatch of Eq. 7 and Eq. 6.
         views: embeddings of each sentence that the VAE is fitted to: the plain one and
@@ -204,8 +205,8 @@ def start_fine_tunings(params: Params, config: TranslatorConfig) -> Params:
 def average_fine_tunings(params: Params) -> Params:
     """The mean of fine-tunings with leaves [F, ...]: one encoder and one classifier.
 
-    They began at the same parameters and went a short way, so that their mean is as good at the
-    sentences that they learnt from as each of them, and better at other sentences.
+    They began at the same parameters and went a short way, so that their mean is an encoder too.
+    What it brings: docs/paper_map.md.
     """
     return jax.tree.map(lambda leaf: leaf.mean(0), params)
 
@@ -215,7 +216,9 @@ def make_fine_tuning(
 ) -> tuple[LossFn, SampleFn]:
     """Loss and minibatches of Eq. 7: cross-entropy of the style, mean over B and F.
 
-    The parameters are those of `start_fine_tunings`, the leaves of a minibatch [F, B, ...].
+    The parameters are those of `start_fine_tunings`, the leaves of a minibatch [F, B, ...]. The
+    fine-tunings share one fit, and so one clip of the gradient's norm, which is that of all.
+    "accuracy" is the mean of theirs; that of their average is not measured on the way.
     """
 
     def sample_fn(key: jax.Array, data: SentenceData) -> SentenceData:

@@ -79,6 +79,48 @@ def test_sentences_name_what_their_style_is_about(environment):
                 assert any(word in sentence.lower() for word in words[part]), (style, sentence)
 
 
+def test_no_sentence_of_the_crossway_is_about_a_corner():
+    # A style is two arms of a cross: there are no corners, rows or arms between two others.
+    arm = r"(arm|aisle|corridor|branch|lane|leg|passage|hallway|corner|quarter)"
+    corner = re.compile(rf"corner|\b(upper|lower|top|bottom)[ -](left|right) {arm}\b|\brow\b")
+    for style, sentences in load_instructions("overcooked/crossway").items():
+        for sentence in sentences.train:
+            assert not corner.search(sentence.lower()), (style, sentence)
+
+
+SIDED = sorted(name for name, styles in STYLES.items() if "left" in " ".join(styles))
+
+
+@pytest.mark.parametrize("environment", SIDED)
+def test_a_sentence_with_left_and_right_exchanged_is_of_the_mirrored_style(environment):
+    instructions = load_instructions(environment, STYLES[environment])
+    style_of = {s.lower(): style for style, told in instructions.items() for s in told.train}
+    pairs = 0
+    for sentence, style in style_of.items():
+        other = style_of.get(exchanged(sentence))
+        if other is not None and exchanged(sentence) != sentence:
+            pairs += 1
+            assert other == exchanged(style), sentence
+    assert pairs > 0
+
+
+def exchanged(text: str) -> str:
+    """Left for right and right for left."""
+    other = {"left": "right", "right": "left"}
+    return re.sub("left|right", lambda found: other[found[0]], text)
+
+
+def test_sentences_of_the_arm_name_their_side_if_they_have_one():
+    for style, (train, test) in load_instructions("assistive/jaco").items():
+        task, place = style.split("_", 1)
+        for sentence in (*train, *test):
+            sides = {side for side in ("left", "right") if side in sentence.lower()}
+            if task in ("feed", "drink"):
+                assert place in sides, (style, sentence)
+            else:
+                assert not sides, (style, sentence)
+
+
 def level_said(sentence: str) -> tuple[str, int]:
     """How a sentence says a level, and which: by its size, as a digit or as a word."""
     # "The one that …" says no number.

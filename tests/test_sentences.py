@@ -35,7 +35,7 @@ def test_sentences_left_out_are_translated_too():
     )
     plain = sentences.cross_validate(small_encoder(), QUICK, prepared(), folds=4, seeds=1)
     np.testing.assert_allclose(translated.probability, plain.probability, atol=1e-5)
-    np.testing.assert_array_equal(translated.told, translated.translated)
+    assert translated.classified_right.mean() == plain.right.mean()
     assert translated.right.mean() >= 0.6
     assert plain.translated is None
 
@@ -48,10 +48,8 @@ def test_whole_authors_may_be_left_out():
     says = jax.nn.one_hot(told.style, 3)[:, None] * jnp.where(author == 0, 1.0, -1.0)
     told = told.replace(hidden=hidden.at[:, 1:4, :3].add(5.0 * says))
     dealt, by_author = (
-        sentences.cross_validate(
-            small_encoder(), QUICK, told, folds=2, seeds=1, consecutive=consecutive
-        )
-        for consecutive in (False, True)
+        sentences.cross_validate(small_encoder(), QUICK, told, folds=2, seeds=1, authors=authors)
+        for authors in ((), (2, 2))
     )
     assert dealt.right.mean() == 1.0
     assert by_author.right.mean() < 0.7
@@ -59,7 +57,9 @@ def test_whole_authors_may_be_left_out():
 
 def test_a_record_of_another_environment_is_refused():
     record = Path(__file__).parents[1] / "docs/comparisons/lbf/spread"
-    with pytest.raises(UserError, match="is of lbf/spread; expected one of overcooked/crossway"):
+    with pytest.raises(
+        UserError, match=r"is of lbf/spread with .*; expected overcooked/crossway and"
+    ):
         sentences.run(sentences.Arguments("overcooked/crossway", record=record))
 
 
@@ -81,6 +81,8 @@ def test_labels_without_meaning_are_told_no_better_than_by_chance():
         ({"folds": 1}, "folds is 1; expected 2 to 4"),
         ({"folds": 5}, "folds is 5; expected 2 to 4"),
         ({"seeds": 0}, "seeds is 0; expected at least 1"),
+        ({"authors": (4,)}, "authors is 1; expected 2 to 4"),
+        ({"authors": (1, 2)}, "authors wrote 3 sentences of a style; expected 4"),
     ],
 )
 def test_bad_numbers_are_refused(change, message):
@@ -100,12 +102,14 @@ def test_the_packaged_sentences_are_cross_validated(capsys):
         fine_tunings=1,
         fine_tuning=FitConfig(learning_rate=1e-4, steps=24),
     )
-    arguments = sentences.Arguments("assistive/jaco", folds=2, translator=short)
+    record = Path(__file__).parents[1] / "docs/comparisons/assistive/jaco"
+    arguments = sentences.Arguments("assistive/jaco", folds=2, translator=short, record=record)
     found = sentences.run(arguments)
     assert found.right.shape == (1, 320)
     assert found.right.mean() > 0.5  # by chance 0.125
     sentences.print_left_out(sentences.Console(width=120), arguments, found)
     printed = capsys.readouterr().out
-    assert f"Told right by the classifier: {found.right.mean():.3f} of 320" in printed
+    assert f"Told right by the translation: {found.right.mean():.3f}." in printed
+    assert f"Told right by the classifier: {found.classified_right.mean():.3f} of 320" in printed
     assert "scratch_upper_arm" in printed
     assert printed.count("is taken for") == (~found.right).sum()
