@@ -71,8 +71,11 @@ _TOLD_START = PresetChanges(
 
 ADAPTATIONS = {
     # Pairs that begin at the same pot keep to it, and so do refits of their egos, beside partners
-    # that would serve both; an ego that has met all styles knows better.
-    "overcooked/center_pots": Adaptation(presets={"quick": _TOLD_START}),
+    # that would serve both; an ego that has met all styles knows better. Whether it finds the
+    # second pot in every style is chance, so that there are two of them to choose from.
+    "overcooked/center_pots": Adaptation(
+        presets={"quick": dataclasses.replace(_TOLD_START, told_start=None)}
+    ),
     # Both players must learn to give way.
     "overcooked/crossway": Adaptation(
         length=1.7,
