@@ -92,7 +92,7 @@ def measure(
     Raises:
         UserError: there is no finished run at `path`, another process writes it, a method was
             measured with other steps or seeds already, `added` defines no methods, or an ablation
-            is asked of a run that came from a record.
+            is asked of a run that came from a record or whose sentences have changed since.
     """
     from experiments import report
     from experiments.finished_run import open_run
@@ -120,6 +120,7 @@ def measure(
         for name, method in chosen.items():
             if name in ABLATIONS and not folder.stage_done(stages[name]):
                 folder.expect_stages(STAGE_NAMES)
+                run.expect_learnt_sentences()
             if folder.stage_done(stages[name]):
                 _expect_same(name, stages[name], folder.stage_metrics(stages[name]), budgets[name])
             with as_user_error():

@@ -40,6 +40,7 @@ def evaluate(run: Run, task: StageProgress) -> dict[str, Any]:
     """Measures every method; returns what `results.json` is made of."""
     config, env = run.config.evaluation, run.env
     population, archive = load_population(run), load_archive(run)
+    run.expect_learnt_sentences()
     haland = load_haland(run)
     language = load_task_language(run)
     judge = Judge(env, config.games, config.batch)

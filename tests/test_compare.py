@@ -172,6 +172,16 @@ def test_the_figures_of_the_paper_are_drawn_from_the_results_alone(
     assert "left no onion" in table
 
 
+@pytest.mark.slow
+def test_a_run_that_learnt_other_sentences_is_refused(smoke_run, tmp_path):
+    copy = Path(shutil.copytree(smoke_run, tmp_path / "copy"))
+    metrics = json.loads((copy / "translator" / "metrics.json").read_text())
+    assert len(metrics["sentences"]) == 64
+    (copy / "translator" / "metrics.json").write_text(json.dumps(metrics | {"sentences": "other"}))
+    with pytest.raises(UserError, match=r"training sentences have changed .*remove .*translator"):
+        compare.measure(copy, ("no-vae",), STEPS, 2)
+
+
 def test_methods_that_are_none_are_refused(capsys, monkeypatch, smoke_run, tmp_path):
     line = refused(capsys, monkeypatch, compare, smoke_run, "--methods", "fpc")
     assert "did you mean 'fcp'?" in line

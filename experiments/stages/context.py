@@ -1,6 +1,8 @@
 """What every stage is given."""
 
 import dataclasses
+import hashlib
+import json
 from pathlib import Path
 from typing import Any
 
@@ -9,6 +11,7 @@ import jax
 import envs
 from envs.instructions import Instructions, load_instructions
 from experiments.configs import RunConfig
+from experiments.errors import UserError
 from experiments.run_folder import RunFolder
 
 STAGE_NAMES = (
@@ -20,6 +23,11 @@ STAGE_NAMES = (
     "diffusion",
     "translator",
 )
+
+SENTENCES = "sentences"
+"""Where the metrics of the translator's stage keep the digest of its training sentences."""
+STAGES_OF_SENTENCES = ("translator", "evaluation", "report")
+"""What depends on the sentences."""
 
 
 @dataclasses.dataclass
@@ -40,6 +48,26 @@ class Run:
     def instructions(self) -> dict[str, Instructions]:
         """The packaged sentences, in the order of the styles."""
         return load_instructions(self.config.environment, self.env.style_names)
+
+    def sentences_digest(self) -> str:
+        """SHA-256 of the packaged training sentences, in the order of the styles."""
+        sentences = [style.train for style in self.instructions().values()]
+        return hashlib.sha256(json.dumps(sentences).encode()).hexdigest()
+
+    def expect_learnt_sentences(self) -> None:
+        """Makes sure that the translator has learnt from the packaged training sentences.
+
+        Raises:
+            UserError: it has learnt from others, those of another version.
+        """
+        # A run from before this was noted does not say.
+        learnt = self.folder.stage_metrics("translator").get(SENTENCES)
+        if learnt not in (None, self.sentences_digest()):
+            folders = ", ".join(str(self.folder.path / n) for n in STAGES_OF_SENTENCES)
+            raise UserError(
+                "the training sentences have changed since the translator of this run learnt from "
+                f"them; remove {folders}, and the folders of its methods, and continue the run"
+            )
 
     def path(self, stage: str, name: str) -> Path:
         """Where a checkpoint of a stage lies."""

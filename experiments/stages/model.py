@@ -10,7 +10,7 @@ import numpy as np
 from experiments.errors import as_user_error
 from experiments.progress import StageProgress
 from experiments.stages.best_responses import load_archive, load_task_language
-from experiments.stages.context import Run
+from experiments.stages.context import SENTENCES, Run
 from experiments.stages.population import load_population
 from experiments.training import Saver, run_fit
 from haland_jax import (
@@ -259,7 +259,8 @@ def fit_translator(run: Run, task: StageProgress) -> dict[str, Any]:
         offset=config.fine_tuning.steps,
     )
     checkpoint.save(run.path("translator", "model"), {"fine_tuned": tuned, "vae": vae})
-    return {**{f"fine_tuning_{k}": v for k, v in first.items()}, **second}
+    learnt = {f"fine_tuning_{k}": v for k, v in first.items()}
+    return {**learnt, **second, SENTENCES: run.sentences_digest()}
 
 
 def fit_translation(
