@@ -65,17 +65,14 @@ class Adaptation:
     presets: Mapping[str, PresetChanges] = dataclasses.field(default_factory=dict)
 
 
-_TOLD_START = PresetChanges(
-    compression=LONG_COMPRESSION, universal_start_steps=40_000_000, told_start=True
-)
+_UNIVERSAL_START = PresetChanges(compression=LONG_COMPRESSION, universal_start_steps=40_000_000)
+_TOLD_START = dataclasses.replace(_UNIVERSAL_START, told_start=True)
 
 ADAPTATIONS = {
     # Pairs that begin at the same pot keep to it, and so do refits of their egos, beside partners
     # that would serve both; an ego that has met all styles knows better. Whether it finds the
     # second pot in every style is chance, so that there are two of them to choose from.
-    "overcooked/center_pots": Adaptation(
-        presets={"quick": dataclasses.replace(_TOLD_START, told_start=None)}
-    ),
+    "overcooked/center_pots": Adaptation(presets={"quick": _UNIVERSAL_START}),
     # Both players must learn to give way.
     "overcooked/crossway": Adaptation(
         length=1.7,
@@ -114,9 +111,7 @@ ADAPTATIONS = {
         max_steps=50,
         length=0.4,
         training={"reward_scale": 2.0, "confined_until": 0.0},
-        presets={
-            "quick": PresetChanges(compression=LONG_COMPRESSION, universal_start_steps=40_000_000)
-        },
+        presets={"quick": _UNIVERSAL_START},
     ),
     # Speeds of joints, and observations of several units. At the mouth all pairs succeed within
     # 0.4 M steps; scratching and bathing take longest. High rates ruin egos that are good already.
