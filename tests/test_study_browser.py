@@ -99,7 +99,8 @@ def test_from_consent_to_thanks(browser, study):
     reach(page, 2)
     assert drawn(page) > 10
     page.click("text=I have seen enough")
-    tasks = []
+    tasks, scripts = [], []
+    page.route("**/static/replay.js", lambda route: scripts.append(route))
     for number, rating in ((1, 5), (2, 2)):
         assert f"Round {number} of 2" in page.inner_text("h1")
         tasks.append(page.inner_text(".task"))
@@ -109,12 +110,20 @@ def test_from_consent_to_thanks(browser, study):
         page.click(f".rating label:nth-of-type({rating})")
         page.fill("textarea", f"comment {number}")
         page.click("text=Go on")
-    assert "Thank you" in page.inner_text("h1")
+    until(page, "document.querySelector('h1').textContent === 'Thank you'")
     code = page.inner_text(".code")
+    assert page.is_disabled("text=Round 2"), "a click before the script has come would be lost"
+    scripts[0].continue_()
+    page.route("**/study/replay/0", lambda route: route.abort())
+    page.click("text=Round 1")
+    until(page, "document.querySelector('.note').textContent.includes('cannot be shown')")
+    assert page.is_visible(".note")
     page.click("text=Round 2")
     reach(page, 5)
+    assert page.inner_text(".note") == ""
     assert drawn(page) > 10
-    assert not [line for line in said if "favicon" not in line], said
+    said = [line for line in said if "favicon" not in line and "ERR_FAILED" not in line]
+    assert not said, said  # ERR_FAILED: the request that was aborted
 
     store = Store(f"sqlite:///{folder / 'study.db'}")
     rounds = [one for one in store.rounds() if one.participant.code == code]

@@ -3,17 +3,16 @@
 import { Board } from "./board.js";
 
 const stage = document.getElementById("replay");
+const note = stage.querySelector(".note");
 let board, timer;
 
 async function play(address) {
   clearInterval(timer);
-  const answer = await fetch(address);
-  if (!answer.ok) {
-    stage.querySelector(".note").textContent = "This game cannot be shown.";
-    return;
-  }
-  const film = await answer.json();
   stage.hidden = false;
+  note.textContent = "One moment …";
+  const film = await fetch(address).then((answer) => (answer.ok ? answer.json() : null), () => null);
+  note.textContent = film ? "" : "This game cannot be shown.";
+  if (!film) return;
   board ??= new Board(stage);
   let next = 0;
   const step = () => {
@@ -28,4 +27,5 @@ async function play(address) {
 if (stage.dataset.film) play(stage.dataset.film);
 for (const button of document.querySelectorAll(".replay-button")) {
   button.addEventListener("click", () => play(button.dataset.film));
+  button.disabled = false; // The page has it disabled, so that no click comes before this line.
 }
