@@ -26,11 +26,12 @@ from rich.progress import track
 from rich.table import Table
 
 import envs
-from envs.instructions import load_instructions
+from envs.instructions import load_instructions, training_sentences
 from experiments import devices
 from experiments.errors import UserError, as_user_error, main_guard
 from experiments.machine import describe_machine
 from experiments.reading import read_runs
+from experiments.stages import prepare_instructions
 from haland_jax import bert_weights, fit, task_language, translator
 from haland_jax.translator import SentenceData, TranslatorConfig
 
@@ -213,14 +214,10 @@ def run(arguments: Arguments) -> LeftOut:
         instructions = load_instructions(arguments.environment, env.style_names)
         encoder = bert_weights.load_encoder(arguments.encoder or None)
         tokenizer = bert_weights.load_tokenizer(arguments.encoder or None)
-        config = arguments.translator
-        wordings = [sentence for style in instructions.values() for sentence in style.train]
-        styles = [i for i, style in enumerate(instructions.values()) for _ in style.train]
-        tokens = bert_weights.tokenize(tokenizer, wordings, config.maximum_length)
-        sentences = translator.prepare_sentences(encoder, config, *tokens, np.array(styles))
+        sentences = prepare_instructions(instructions, encoder, tokenizer, arguments.translator)
     return cross_validate(
         encoder,
-        config,
+        arguments.translator,
         sentences,
         folds=arguments.folds,
         seeds=arguments.seeds,
@@ -243,8 +240,7 @@ def _task_language(record: Path, environment: str, style_names: tuple[str, ...])
 def print_left_out(console: Console, arguments: Arguments, found: LeftOut) -> None:
     """Prints the share of right answers by style, and each sentence that was ever mistaken."""
     env = envs.make(arguments.environment)
-    instructions = load_instructions(arguments.environment, env.style_names)
-    wordings = [sentence for style in instructions.values() for sentence in style.train]
+    wordings, _ = training_sentences(load_instructions(arguments.environment, env.style_names))
     machine = ", ".join(f"{name} {value}" for name, value in describe_machine().items())
     by = "classifier" if found.translated is None else "translation"
     title = f"{arguments.environment}: styles told by the {by} from sentences left out"

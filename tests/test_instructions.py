@@ -5,7 +5,7 @@ from pathlib import Path
 
 import pytest
 
-from envs.instructions import load_instructions, read_instructions
+from envs.instructions import load_instructions, read_instructions, training_sentences
 
 ORDERS = tuple(f"{soup}_{cell}" for soup in ("onion", "tomato") for cell in (1, 2, 3, 4))
 CORNERS = ("upper_left", "upper_right", "lower_left", "lower_right")
@@ -54,6 +54,14 @@ def test_every_style_has_as_many_training_and_test_sentences(environment):
     for style, sentences in instructions.items():
         assert len(sentences.train) == 40, style
         assert len(sentences.test) == 4, style
+
+
+def test_training_sentences_come_style_by_style(tmp_path):
+    text = GOOD + '[right]\ntrain = ["Go right.", "Stay right."]\ntest = ["To the right."]\n'
+    instructions = read_instructions(write(tmp_path, text), ("right", "left"))
+    wordings, styles = training_sentences(instructions)
+    assert wordings == ["Go right.", "Stay right.", "Go left."]
+    assert styles == [0, 0, 1]
 
 
 @pytest.mark.parametrize("environment", sorted(KITCHENS))

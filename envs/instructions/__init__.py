@@ -79,6 +79,17 @@ def read_instructions(
     return instructions
 
 
+def training_sentences(instructions: Mapping[str, Instructions]) -> tuple[list[str], list[int]]:
+    """All sentences of `train`, style by style, and the number of each one's style."""
+    told = [
+        (sentence, style)
+        for style, sentences in enumerate(instructions.values())
+        for sentence in sentences.train
+    ]
+    wordings, styles = zip(*told, strict=True)
+    return list(wordings), list(styles)
+
+
 def _checked_style(place: str, table: Any) -> Instructions:
     if not isinstance(table, dict) or set(table) != {"train", "test"}:
         found = ", ".join(table) if isinstance(table, dict) else repr(table)

@@ -36,14 +36,14 @@ class WithoutFineTuning:
         """Fits the VAE, and translates all sentences with both translators."""
         run, config = given.run, given.run.config.translator
         language = load_task_language(run)
-        encoder, _ = load_pretrained(run)
+        encoder, tokenizer = load_pretrained(run)
         plain = translator.init_fine_tuning(encoder, config, len(given.sentences))
         vae, _ = fit_translation(
             jax.random.split(given.key, 3),
             config,
             encoder.architecture,
             plain,
-            prepare_instructions(run, encoder),
+            prepare_instructions(run.instructions(), encoder, tokenizer, config),
             language.v_hat,
             given.saver("translation"),
             given.task,

@@ -1,5 +1,6 @@
 """Policy VAE, latent diffusion and translator: what turns a sentence into a policy."""
 
+from collections.abc import Mapping
 from functools import partial
 from typing import Any
 
@@ -7,6 +8,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
+from envs.instructions import Instructions, training_sentences
 from experiments.errors import as_user_error
 from experiments.progress import StageProgress
 from experiments.stages.best_responses import load_archive, load_task_language
@@ -218,22 +220,24 @@ def load_pretrained(run: Run) -> tuple[bert_weights.Encoder, Any]:
         return bert_weights.load_encoder(source), bert_weights.load_tokenizer(source)
 
 
-def prepare_instructions(run: Run, encoder: bert_weights.Encoder) -> translator.SentenceData:
-    """The training sentences after the frozen part of the encoder."""
-    config, (_, tokenizer) = run.config.translator, load_pretrained(run)
-    instructions = run.instructions()
-    sentences = [s for style in instructions.values() for s in style.train]
-    labels = [i for i, style in enumerate(instructions.values()) for _ in style.train]
-    ids, mask = bert_weights.tokenize(tokenizer, sentences, config.maximum_length)
-    return translator.prepare_sentences(encoder, config, ids, mask, np.array(labels))
+def prepare_instructions(
+    instructions: Mapping[str, Instructions],
+    encoder: bert_weights.Encoder,
+    tokenizer: Any,
+    config: translator.TranslatorConfig,
+) -> translator.SentenceData:
+    """The training sentences of all styles after the frozen part of the encoder."""
+    sentences, styles = training_sentences(instructions)
+    tokens = bert_weights.tokenize(tokenizer, sentences, config.maximum_length)
+    return translator.prepare_sentences(encoder, config, *tokens, np.array(styles))
 
 
 def fit_translator(run: Run, task: StageProgress) -> dict[str, Any]:
     """Stage 5: fine-tunes BERT on the training sentences, then fits the translation."""
     config = run.config.translator
     language = load_task_language(run)
-    encoder, _ = load_pretrained(run)
-    prepared = prepare_instructions(run, encoder)
+    encoder, tokenizer = load_pretrained(run)
+    prepared = prepare_instructions(run.instructions(), encoder, tokenizer, config)
     keys = jax.random.split(run.key("translator"), 4)
     initial = translator.init_fine_tuning(encoder, config, len(run.env.style_names))
     fine_tunings, first = _fit_part(
