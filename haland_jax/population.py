@@ -7,6 +7,7 @@ population is shared out over them; the same code runs on several GPUs.
 
 import math
 from collections.abc import Callable
+from functools import partial
 from typing import Any
 
 import jax
@@ -72,6 +73,8 @@ def over_population(
         result = sharded(*common, *own)
         return jax.tree.map(lambda leaf: leaf[:size], result) if missing else result
 
+    named = function.func if isinstance(function, partial) else function
+    call.__name__ = getattr(named, "__name__", "call")  # the program's name in logs and profiles
     compiled = jax.jit(call, donate_argnums=donate, compiler_options=compiler_options)
 
     def placed(*arguments: Any) -> Any:
