@@ -70,6 +70,7 @@ class Overview:
         best_ego: the universal ego that earns most beside Haland; None where none was measured.
         compared: which of the project's other methods `experiments.compare` measured, by the
             options of the command.
+        added: the methods that came from files of their own.
     """
 
     environment: str
@@ -104,6 +105,7 @@ class Overview:
     gain: Gain | None
     best_ego: Standing | None
     compared: Mapping[str, Sequence[str]]
+    added: Sequence[str]
 
     def amount(self, value: float | None) -> str:
         """A return of this environment for a reader; a dash for what was not measured."""
@@ -168,6 +170,7 @@ def overview(results: Mapping[str, Any]) -> Overview:
         gain=gain(results),
         best_ego=best_ego(found),
         compared=_compared(results),
+        added=_added(results),
     )
 
 
@@ -208,6 +211,12 @@ def _compared(results: Mapping[str, Any]) -> dict[str, list[str]]:
     if anyhow:
         groups.setdefault(next(iter(groups), ""), []).extend(anyhow)
     return {options: sorted(names, key=NAMES.index) for options, names in groups.items()}
+
+
+def _added(results: Mapping[str, Any]) -> list[str]:
+    """What methods that are not the project's own call their egos."""
+    found = results.get(COMPARED, {}).items()
+    return [shown for name, one in found if name not in NAMES for shown in one.get("by_ego", {})]
 
 
 def _share(results: Mapping[str, Any], method: str) -> float | None:

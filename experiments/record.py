@@ -1,22 +1,22 @@
 """Keeps what a reader needs of finished runs, and makes the page that compares them.
 
     python -m experiments.record runs/*-overnight-0     record these runs in docs/results
-    python -m experiments.record                        make the pages anew, as after new remarks
+    python -m experiments.record                        make pages and reports anew, from what is
+                                                        recorded, as after new remarks
     python -m experiments.record runs/*-quick-0 --out docs/comparisons --readme None --players
 
-Each run goes to docs/results/<environment>/: results.json, report.md, the figures, one or two
-episodes and, if asked for, the players. docs/results/README.md is made from all that is recorded
-there, and so is the table in the README between its two markers. Where other methods were compared,
-the paper's figures that show them are drawn too, from all that is recorded. Remarks by hand go to
-docs/results/remarks.md, which is included; everything else in that folder is written by this
-command.
+Each run goes to docs/results/<environment>/: results.json, the report that is made of it, the
+figures, one or two episodes and, if asked for, the players. docs/results/README.md is made from all
+that is recorded there, and so is the table in the README between its two markers. Where other
+methods were compared, the paper's figures that show them are drawn too, from all that is recorded.
+Remarks by hand go to docs/results/remarks.md, which is included; everything else in that folder is
+written by this command.
 """
 
 import dataclasses
 import io
 import json
 import os
-import re
 import tempfile
 from collections.abc import Mapping, Sequence
 from pathlib import Path, PurePosixPath
@@ -26,9 +26,10 @@ import tyro
 from PIL import Image
 from rich.console import Console
 
-from experiments import results_page
+from experiments import report, results_page
 from experiments.compared import COMPARED, PLAYER_STAGES, PLAYERS
 from experiments.errors import UserError, main_guard
+from experiments.figures import figures_in
 from experiments.overview import overview
 from experiments.reading import read_runs
 from experiments.run_folder import RunFolder
@@ -45,15 +46,14 @@ COMPARING = ("figure_3", "figure_4", "figure_6a", "universal_learning", "table_1
 """The paper's figures that show other methods."""
 _COLOURS = 128
 _MARKERS = ("<!-- results -->", "<!-- /results -->")
-_LINK = re.compile(r"\]\(([^)#:]+)\)")
 
 
 @dataclasses.dataclass(frozen=True)
 class Arguments:
     """Record finished runs for readers: results, report, figures and a few episodes.
 
-    A run replaces what was recorded of its environment. Without runs, only the pages are made
-    anew from what is recorded.
+    A run replaces what was recorded of its environment. Without runs, only pages and reports are
+    made anew from what is recorded.
     """
 
     runs: tyro.conf.Positional[tuple[Path, ...]] = ()
@@ -112,6 +112,10 @@ def record(
         changed += [f for f in _stale_files(folder, files) if _remove(f)]
         changed += [folder / name for name, data in files.items() if _write(folder / name, data)]
     runs_here = read_recorded(out)
+    for run in runs_here:
+        folder = out / run["environment"]
+        text = report.report_text(run, folder, figures_in(folder / "figures"))
+        changed += [folder / "report.md"] if _write(folder / "report.md", text.encode()) else []
     overviews = [overview(run) for run in runs_here]
     drawn = drawn_comparisons(runs_here, out)
     remarks = out / "remarks.md"
@@ -142,13 +146,10 @@ def recorded_files(path: Path, players: bool = False) -> tuple[str, dict[PurePos
         players: whether its players are kept too.
 
     Raises:
-        UserError: the run is unfinished, or its figures alone are larger than the limit.
+        UserError: the run is unfinished, or its results and figures are larger than the limit.
     """
     folder = RunFolder.read(path, ("report",))
     results = rounded(without_paths(folder.read_json("results.json")))
-    report = path / "report.md"
-    if not report.is_file():
-        raise UserError(f"{report} is missing; delete {path / 'report'} and run again")
     overview(results)
     files = {
         PurePosixPath("results.json"): (json.dumps(results, indent=1) + "\n").encode(),
@@ -157,8 +158,7 @@ def recorded_files(path: Path, players: bool = False) -> tuple[str, dict[PurePos
             for file in sorted((path / "figures").glob("*.png"))
         },
     }
-    text = report.read_text(encoding="utf-8")
-    used = _size(files) + len(text.encode())
+    used = _size(files)
     if used > LIMIT_BYTES:
         raise UserError(
             f"the figures and results of {path} have {used:,} bytes; expected at most "
@@ -175,17 +175,7 @@ def recorded_files(path: Path, players: bool = False) -> tuple[str, dict[PurePos
         from experiments.players import packed
 
         files[PurePosixPath(PLAYERS)] = packed(open_run(path, PLAYER_STAGES))
-    files[PurePosixPath("report.md")] = without_missing_links(text, files).encode()
     return results["environment"], files
-
-
-def without_missing_links(text: str, files: Mapping[PurePosixPath, Any]) -> str:
-    """The report without the lines that show a file which is not among the files."""
-    return "".join(
-        line
-        for line in text.splitlines(keepends=True)
-        if all(PurePosixPath(target) in files for target in _LINK.findall(line))
-    )
 
 
 def without_paths(value: Any) -> Any:

@@ -14,6 +14,7 @@ from experiments.summary import (
     COMPARISONS,
     HEADLINE,
     METHODS,
+    MOST_FROM_A_WRONG_SENTENCE,
     ORACLE,
     PARTNER_SIGHT,
     UNIVERSAL,
@@ -33,6 +34,7 @@ from experiments.summary import (
 from experiments.worth import steps_in_words, worth_of_the_style
 
 _AIM = 0.95
+_NOTABLE_FALL = 0.1
 _WORTH_FIGURE = "cross_play"
 _MEANING = {
     ORACLE: "the best of several egos refitted to that very partner: the upper bound",
@@ -42,7 +44,8 @@ _MEANING = {
     "Diffusion, true task language": "policies drawn from the diffusion model, given the measured "
     "event frequencies",
     "Haland, training sentences": "policies from sentences that the translator was trained on",
-    HEADLINE: "policies from sentences never seen, one sample each: **the headline**",
+    HEADLINE: "policies from sentences that it was not trained on, one sample each: **the "
+    "headline**",
     WRONG: "policies from another style's sentence: the control, which must fall",
 }
 _CAPTIONS = {
@@ -80,6 +83,15 @@ def write_report(results: Mapping[str, Any], folder: str | Path) -> Path:
     """
     folder = Path(folder)
     figures = draw_figures(results, folder / "figures")
+    report = folder / "report.md"
+    writing = report.with_name(".report.md.writing")
+    writing.write_text(report_text(results, folder, figures), encoding="utf-8")
+    writing.replace(report)
+    return report
+
+
+def report_text(results: Mapping[str, Any], folder: Path, figures: Sequence[Path]) -> str:
+    """The report in `folder` with those figures; see `write_report`."""
     sections = [
         _opening(results),
         _headline(results),
@@ -93,11 +105,7 @@ def write_report(results: Mapping[str, Any], folder: str | Path) -> Path:
         _episodes(results, folder),
         _costs(results),
     ]
-    report = folder / "report.md"
-    writing = report.with_name(".report.md.writing")
-    writing.write_text("\n\n".join(filter(None, sections)) + "\n", encoding="utf-8")
-    writing.replace(report)
-    return report
+    return "\n\n".join(filter(None, sections)) + "\n"
 
 
 def summary_table(results: Mapping[str, Any]) -> Table:
@@ -140,8 +148,8 @@ def _verdict(results: Mapping[str, Any]) -> str:
     headline, digits = rows[HEADLINE], return_digits(row.mean for row in rows.values())
     reached = "reaches the aim of" if headline.ratio >= _AIM else "misses the aim of"
     said = [
-        f"From sentences never seen, Haland earns **{headline.ratio:.0%} of the Oracle** "
-        f"({_with_spread(headline.mean, headline.std, digits)} per episode): "
+        f"From sentences it was not trained on, Haland earns **{headline.ratio:.0%} of the "
+        f"Oracle** ({_with_spread(headline.mean, headline.std, digits)} per episode): "
         f"it {reached} {_AIM:.0%}."
     ]
     if "Best response" in rows and rows["Best response"].ratio > 0:
@@ -151,9 +159,14 @@ def _verdict(results: Mapping[str, Any]) -> str:
             f"keeps {headline.ratio / ceiling:.0%}."
         )
     if WRONG in rows:
-        fall = headline.ratio - rows[WRONG].ratio
-        judgement = "the sentence matters" if fall > 0.1 else "the sentence hardly matters here"
-        said.append(f"With a wrong sentence it earns {rows[WRONG].ratio:.0%}: {judgement}.")
+        wrong = rows[WRONG].ratio
+        if wrong <= MOST_FROM_A_WRONG_SENTENCE:
+            judgement = "the sentence matters"
+        elif headline.ratio - wrong > _NOTABLE_FALL:
+            judgement = "the sentence matters, but an ego made for another style gets far here"
+        else:
+            judgement = "the sentence hardly matters here"
+        said.append(f"With a wrong sentence it earns {wrong:.0%}: {judgement}.")
     missed = [name for name, gate in results.get("gates", {}).items() if not gate["met"]]
     if missed:
         said.append(f"**Gates missed: {'; '.join(missed)}.**")

@@ -53,8 +53,8 @@ _MEASURED: tuple[_Column, ...] = (
     (
         "Haland",
         lambda row: row.amount_with_spread(row.haland),
-        "return with held-out partners from test sentences, which no part has seen; one sample "
-        "each, no trial episodes.",
+        "return with held-out partners from test sentences, which no part was trained on; one "
+        "sample each, no trial episodes.",
     ),
     _SHARE,
     (
@@ -154,6 +154,7 @@ def page(
         "To make the same runs, and this page from them:\n\n```bash\n"
         + "\n".join(_commands(overviews, options))
         + "\n```",
+        _added(overviews),
     ]
     if remarks.strip():
         sections.append(f"## Remarks\n\n{remarks.strip()}")
@@ -306,9 +307,9 @@ def _verdict(overviews: Sequence[Overview]) -> str:
     if len(shares) > 1:
         earned += f" to {max(shares):.1%}"
     return (
-        f"Preset {presets}: from sentences never seen, with partners never met, Haland earns "
-        f"{earned} of the Oracle; it reaches the aim of {AIM:.0%} in {reached} of {len(shares)} "
-        "environments."
+        f"Preset {presets}: from sentences it was not trained on, with partners never met, Haland "
+        f"earns {earned} of the Oracle; it reaches the aim of {AIM:.0%} in {reached} of "
+        f"{len(shares)} environments."
     )
 
 
@@ -344,6 +345,17 @@ def _commands(overviews: Sequence[Overview], options: str) -> list[str]:
     compared = [command for row in overviews for command in _comparisons(row)]
     record = f"uv run python -m experiments.record {' '.join(recorded)}{options}"
     return [*made, *compared, record]
+
+
+def _added(overviews: Sequence[Overview]) -> str:
+    """How the methods were measured that are not the project's own; empty where there are none."""
+    names = list(dict.fromkeys(name for row in overviews for name in row.added))
+    if not names:
+        return ""
+    return (
+        f"Added from files of their own, by `python -m experiments.compare RUN --methods --add "
+        f"FILE`: {', '.join(names)}."
+    )
 
 
 def _comparisons(row: Overview) -> list[str]:

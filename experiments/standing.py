@@ -62,15 +62,20 @@ class Standing(NamedTuple):
 
     @property
     def verdict(self) -> str:
-        """Where Haland is: "ahead" or "behind"; "level" where the lead's interval has 0 in it."""
-        if self.lead.low <= 0 <= self.lead.high:
-            return "level"
-        return "ahead" if self.lead.value > 0 else "behind"
+        """Where Haland is; see `verdict_of`."""
+        return verdict_of(self.lead)
 
     @property
     def apart(self) -> bool:
         """Whether the two intervals of the interquartile means have no point in common."""
         return not self.haland.overlaps(self.share)
+
+
+def verdict_of(lead: Estimate) -> str:
+    """Where one is who leads by that: "ahead" or "behind"; "level" if the interval has 0 in it."""
+    if lead.low <= 0 <= lead.high:
+        return "level"
+    return "ahead" if lead.value > 0 else "behind"
 
 
 def compared(runs: Iterable[Results]) -> list[str]:

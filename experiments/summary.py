@@ -18,6 +18,8 @@ ORACLE = "Oracle"
 BEST_RESPONSE = "Best response"
 HEADLINE = "Haland, test sentences"
 WRONG = "Haland, wrong sentence"
+MOST_FROM_A_WRONG_SENTENCE = 0.6
+"""Share of the Oracle from which on an ego of another style's sentence has not fallen: a gate."""
 UNIVERSAL = "Universal ego"
 UNIVERSAL_WITH_LABEL = "Universal ego with the style's label"
 METHODS = (

@@ -5,11 +5,13 @@ from typing import Any
 
 import numpy as np
 
-from experiments.standing import without_memory
+from experiments.intervals import mean_estimate
+from experiments.standing import verdict_of, without_memory
 from experiments.summary import (
     BEST_RESPONSE,
     HEADLINE,
     MethodSummary,
+    ratios,
     return_digits,
     summarise,
 )
@@ -72,11 +74,11 @@ def _for_one_ego(results: Mapping[str, Any], rows: Mapping[str, MethodSummary]) 
     ahead = HEADLINE if HEADLINE in rows else BEST_RESPONSE
     if ahead in rows:
         best = max(plain, told, key=lambda row: row.ratio)
-        lead = rows[ahead].ratio - best.ratio
-        place = "ahead of" if lead > 0 else "behind"
+        lead = mean_estimate(ratios(results, ahead) - ratios(results, best.method))
+        place = {"ahead": "ahead of", "level": "level with", "behind": "behind"}[verdict_of(lead)]
         said.append(
-            f"{ahead} ({rows[ahead].ratio:.0%}) is {place} the better of the two by "
-            f"{abs(lead):.0%} of the Oracle."
+            f"{ahead} ({rows[ahead].ratio:.0%}) is {place} the better of the two: "
+            f"{lead.value:+.2f} [{lead.low:+.2f}, {lead.high:+.2f}] of the Oracle."
         )
     return said
 

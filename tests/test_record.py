@@ -163,13 +163,19 @@ def test_the_page_has_the_commands_every_column_and_the_remarks():
 
 def test_the_page_has_the_commands_that_compared_other_methods():
     nothing: dict = {"by_ego": {}}
-    compared = {"no-vae": nothing, "of-ones-own": nothing, "universal": {**nothing, "seeds": 3}}
+    compared = {
+        "no-vae": nothing,
+        "of-ones-own": {"by_ego": {"My method": []}},
+        "universal": {**nothing, "seeds": 3},
+    }
     rows = [overview(small_results(compared=compared)), overview(small_results(environment=OTHER))]
     page = results_page.page(rows, "")
     run = f"runs/{KITCHEN.replace('/', '-')}-overnight-0"
     command = f"uv run python -m experiments.compare {run} --seeds 3 --methods universal no-vae\n"
     assert command in page
-    assert page.count("experiments.compare") == 1
+    assert page.count("experiments.compare runs/") == 1
+    assert "`python -m experiments.compare RUN --methods --add FILE`: My method.\n" in page
+    assert "--add" not in results_page.page(rows[1:], "")
 
 
 def test_what_was_asked_for_stands_in_the_commands():
@@ -207,12 +213,9 @@ def finished(path: Path, environment: str = KITCHEN, **changes) -> Path:
         folder.finish_stage("report", {})
     picture(path / "figures" / "cross_play.png")
     (path / "figures" / "cross_play.pdf").write_bytes(b"%PDF")
-    lines = ["# Report\n", "![cross play](figures/cross_play.png)\n"]
     for style in results["styles"]:
         picture(path / "figures" / "episodes" / f"{style}.gif")
         picture(path / "figures" / "episodes" / f"{style}.png")
-        lines.append(f"| {style} | ![{style}](figures/episodes/{style}.gif) |\n")
-    (path / "report.md").write_text("".join(lines))
     return path
 
 
@@ -242,7 +245,7 @@ def test_a_run_is_recorded_with_pictures_and_links_that_work(tmp_path, readme):
         assert kept.mode == "P"
     text = readme.read_text()
     assert text.startswith(
-        "# Title\n\nbefore\n\n<!-- results -->\n\nPreset `quick`: from sentences never seen"
+        "# Title\n\nbefore\n\n<!-- results -->\n\nPreset `quick`: from sentences it was not"
     )
     assert text.endswith("\n\n<!-- /results -->\n\nafter\n")
     assert "docs/results/overcooked/crossway/report.md" in text
@@ -263,6 +266,17 @@ def test_recording_again_changes_nothing_and_new_remarks_only_the_page(tmp_path,
     (out / "remarks.md").write_text("The crossway is narrow.\n")
     assert record.record([], out, readme) == [out / "README.md"]
     assert "The crossway is narrow." in (out / "README.md").read_text()
+
+
+def test_reports_are_made_anew_from_what_is_recorded(tmp_path, readme):
+    out = tmp_path / "results"
+    record.record([finished(tmp_path / "run")], out, readme)
+    file = out / KITCHEN / "report.md"
+    made = file.read_text()
+    assert made.count("](figures/episodes/") == 2, "as many as are recorded"
+    file.write_text("Words of an earlier version.\n")
+    assert record.record([], out, readme) == [file]
+    assert file.read_text() == made
 
 
 def test_a_second_environment_joins_and_a_new_run_replaces_the_old(tmp_path, readme):
@@ -354,7 +368,7 @@ def test_what_cannot_be_recorded_is_refused_and_nothing_is_written(
         ((good, tmp_path / "nowhere"), "nowhere is missing"),
         ((good, good), f"a second run of {KITCHEN}"),
         ((), "nothing is recorded in docs/results"),
-        ((good, "--readme", good / "report.md"), "lacks the markers <!-- results -->"),
+        ((good, "--readme", good / "results.json"), "lacks the markers <!-- results -->"),
         ((good, "--readme", "none.md"), "none.md is missing"),
     ):
         line = refused(capsys, monkeypatch, record, *arguments)

@@ -61,9 +61,9 @@ def test_successes_are_shown_where_games_can_succeed(tmp_path):
 @pytest.mark.parametrize(
     ("told", "haland", "expected"),
     [
-        (0.8, 0.9, ("the label is worth something", "(90%) is ahead of", "by 10% of the Oracle")),
-        (0.61, 0.5, ("hardly changes", "(50%) is behind", "two by 11% of the Oracle")),
-        (0.4, 0.9, ("optimisation, not information", "(90%) is ahead of", "by 30% of the Oracle")),
+        (0.8, 0.9, ("the label is worth something", "(90%) is ahead of", "two: +0.10 [")),
+        (0.61, 0.5, ("hardly changes", "(50%) is behind", "two: -0.11 [")),
+        (0.4, 0.9, ("optimisation, not information", "(90%) is ahead of", "two: +0.30 [")),
     ],
 )
 def test_what_the_style_is_worth_is_said_in_words(tmp_path, told, haland, expected):
@@ -96,6 +96,7 @@ def test_the_universal_egos_are_listed_with_their_budget(tmp_path):
     ("share", "wrong", "expected"),
     [
         (0.97, 0.3, ("97% of the Oracle", "reaches the aim", "the sentence matters")),
+        (0.99, 0.71, ("99% of the Oracle", "reaches the aim", "another style gets far here")),
         (0.80, 0.78, ("80% of the Oracle", "misses the aim", "hardly matters")),
     ],
 )
