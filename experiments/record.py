@@ -5,8 +5,8 @@
                                                         recorded, as after new remarks
     python -m experiments.record runs/*-quick-0 --out docs/comparisons --readme None --players
 
-Each run goes to docs/results/<environment>/: results.json, the report that is made of it, the
-figures, one or two episodes and, if asked for, the players. docs/results/README.md is made from all
+Each run goes to docs/results/<environment>/: results.json, the report and the figures that are made
+of it, one or two episodes and, if asked for, the players. docs/results/README.md is made from all
 that is recorded there, and so is the table in the README between its two markers. Where other
 methods were compared, the paper's figures that show them are drawn too, from all that is recorded.
 Remarks by hand go to docs/results/remarks.md, which is included; everything else in that folder is
@@ -29,7 +29,7 @@ from rich.console import Console
 from experiments import report, results_page
 from experiments.compared import COMPARED, PLAYER_STAGES, PLAYERS
 from experiments.errors import UserError, main_guard
-from experiments.figures import figures_in
+from experiments.figures import draw_figures
 from experiments.overview import overview
 from experiments.reading import read_runs
 from experiments.run_folder import RunFolder
@@ -113,9 +113,7 @@ def record(
         changed += [folder / name for name, data in files.items() if _write(folder / name, data)]
     runs_here = read_recorded(out)
     for run in runs_here:
-        folder = out / run["environment"]
-        text = report.report_text(run, folder, figures_in(folder / "figures"))
-        changed += [folder / "report.md"] if _write(folder / "report.md", text.encode()) else []
+        changed += make_report(run, out / run["environment"])
     overviews = [overview(run) for run in runs_here]
     drawn = drawn_comparisons(runs_here, out)
     remarks = out / "remarks.md"
@@ -146,23 +144,16 @@ def recorded_files(path: Path, players: bool = False) -> tuple[str, dict[PurePos
         players: whether its players are kept too.
 
     Raises:
-        UserError: the run is unfinished, or its results and figures are larger than the limit.
+        UserError: the run is unfinished, or its results are larger than the limit.
     """
     folder = RunFolder.read(path, ("report",))
     results = rounded(without_paths(folder.read_json("results.json")))
     overview(results)
-    files = {
-        PurePosixPath("results.json"): (json.dumps(results, indent=1) + "\n").encode(),
-        **{
-            PurePosixPath("figures", file.name): _with_fewer_colours(file)
-            for file in sorted((path / "figures").glob("*.png"))
-        },
-    }
+    files = {PurePosixPath("results.json"): (json.dumps(results, indent=1) + "\n").encode()}
     used = _size(files)
     if used > LIMIT_BYTES:
         raise UserError(
-            f"the figures and results of {path} have {used:,} bytes; expected at most "
-            f"{LIMIT_BYTES:,}"
+            f"the results of {path} have {used:,} bytes; expected at most {LIMIT_BYTES:,}"
         )
     styles = results["styles"]
     for style in styles[:: -(-len(styles) // EPISODES)]:
@@ -176,6 +167,29 @@ def recorded_files(path: Path, players: bool = False) -> tuple[str, dict[PurePos
 
         files[PurePosixPath(PLAYERS)] = packed(open_run(path, PLAYER_STAGES))
     return results["environment"], files
+
+
+def make_report(results: Mapping[str, Any], folder: Path) -> list[Path]:
+    """Draws the figures of a record and writes its report, from its results.
+
+    Args:
+        results: the recorded results.
+        folder: where they are recorded, with the episodes.
+
+    Returns:
+        The files that changed.
+    """
+    figures = folder / "figures"
+    with tempfile.TemporaryDirectory() as temporary:
+        drawn = {
+            figures / file.name: _with_fewer_colours(file)
+            for file in draw_figures(results, temporary)
+        }
+    earlier = [file for file in sorted(figures.glob("*.png")) if file not in drawn]
+    changed = [file for file in earlier if _remove(file)]
+    changed += [file for file, data in drawn.items() if _write(file, data)]
+    text = report.report_text(results, folder, list(drawn))
+    return changed + ([folder / "report.md"] if _write(folder / "report.md", text.encode()) else [])
 
 
 def without_paths(value: Any) -> Any:
@@ -246,13 +260,11 @@ def _size(files: Mapping[PurePosixPath, bytes]) -> int:
 
 
 def _stale_files(folder: Path, files: Mapping[PurePosixPath, bytes]) -> list[Path]:
-    """Pictures and players of an earlier record that the new one does not have."""
+    """Episodes and players of an earlier record that the new one does not have."""
     return [
         file
-        for file in (*sorted((folder / "figures").rglob("*")), folder / PLAYERS)
-        if file.is_file()
-        and file.suffix in (".png", ".gif", ".safetensors")
-        and PurePosixPath(file.relative_to(folder).as_posix()) not in files
+        for file in (*sorted((folder / "figures" / "episodes").glob("*.gif")), folder / PLAYERS)
+        if file.is_file() and PurePosixPath(file.relative_to(folder).as_posix()) not in files
     ]
 
 

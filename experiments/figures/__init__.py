@@ -1,4 +1,3 @@
 """Figures from results.json: those of one run, and the paper's from several runs."""
 
 from experiments.figures.of_run import draw_figures as draw_figures
-from experiments.figures.of_run import figures_in as figures_in

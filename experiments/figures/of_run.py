@@ -48,12 +48,6 @@ def draw_figures(results: Mapping[str, Any], folder: str | Path) -> list[Path]:
     return drawn
 
 
-def figures_in(folder: Path) -> list[Path]:
-    """The figures that `draw_figures` left in a folder, in the order of the report."""
-    files = [folder / f"{name}.png" for name in FIGURES]
-    return [file for file in files if file.is_file()]
-
-
 def share_of_oracle(results: Mapping[str, Any]) -> Figure:
     """Return divided by the Oracle's, a bar a method, a dot a held-out seed."""
     methods = methods_of(results)
