@@ -85,7 +85,7 @@ class PartnersConfig:
         oracle: training of an ego against one frozen held-out partner.
         oracle_candidates: egos that are refitted for each held-out partner.
         mirror: also learn with the partners of other styles as they look in the environment's
-            mirrors, where it has any.
+            mirrors, where it has any, and take other styles' egos that are clearly better there.
         universal_start: also refit a universal ego for each style (`choose_universal`), and keep
             that start, unless the style's own is clearly better.
         told_start: it is always the one that is told the style, and only its steps are counted.
@@ -356,19 +356,60 @@ def with_mirror_images(env: Environment, policies: Policy) -> Policy:
     Returns:
         Actors, [style, seed * (1 + symmetries)]; the given ones come first.
     """
-    images = [_seen_in(mirror, policies) for mirror in env.symmetries]
+    images = [_of_style_seen_in(mirror, _actors_in(mirror, policies)) for mirror in env.symmetries]
     return jax.tree.map(lambda *leaves: jnp.concatenate(leaves, axis=1), policies, *images)
 
 
-def _seen_in(mirror: Symmetry, policies: Policy) -> Policy:
-    """The partners of each style that are in the mirror of one, [style, seed]."""
-    layers = dict(policies["params"])
-    names = layer_names(policies)
-    first = layers[names[0]]
-    layers[names[0]] = {**first, "kernel": first["kernel"][..., np.argsort(mirror.observation), :]}
+def egos_seen_in(mirror: Symmetry, egos: Player) -> Player:
+    """The egos of other styles as they look in a mirror.
+
+    An ego that has learnt with the partners of a style, and with the images of those of the style
+    that is seen in its place, is in the mirror one that has learnt with the very same partners.
+
+    Args:
+        mirror: one of the environment's `symmetries`.
+        egos: leading axes [style, seed].
+
+    Returns:
+        Egos [style, seed]: those of each style are the images of another one's.
+    """
+    normaliser = egos.normaliser
+    if normaliser is not None:
+        seen = _numbers_in(mirror, normaliser.mean.shape[-1])
+        normaliser = normaliser.replace(
+            mean=normaliser.mean[..., seen], variance=normaliser.variance[..., seen]
+        )
+    images = Player(_actors_in(mirror, egos.actor), _inputs_in(mirror, egos.critic), normaliser)
+    return _of_style_seen_in(mirror, images)
+
+
+def _of_style_seen_in(mirror: Symmetry, players: Any) -> Any:
+    """Deals players [style, …] to the styles as which theirs appear."""
+    return jax.tree.map(lambda leaf: leaf[np.argsort(mirror.styles)], players)
+
+
+def _actors_in(mirror: Symmetry, actors: Policy) -> Policy:
+    """Actors that see and do what is in the mirror what the given ones see and do."""
+    layers = dict(_inputs_in(mirror, actors)["params"])
+    last = layer_names(actors)[-1]
     shown = np.argsort(mirror.actions)
-    layers[names[-1]] = {key: leaf[..., shown] for key, leaf in layers[names[-1]].items()}
-    return jax.tree.map(lambda leaf: leaf[np.argsort(mirror.styles)], {"params": layers})
+    layers[last] = {key: leaf[..., shown] for key, leaf in layers[last].items()}
+    return {**actors, "params": layers}
+
+
+def _inputs_in(mirror: Symmetry, networks: Any) -> Any:
+    """Networks that say of a mirrored observation what the given ones say of the observation."""
+    layers = dict(networks["params"])
+    first = layer_names(networks)[0]
+    kernel = layers[first]["kernel"]
+    seen = _numbers_in(mirror, kernel.shape[-2])
+    layers[first] = {**layers[first], "kernel": kernel[..., seen, :]}
+    return {**networks, "params": layers}
+
+
+def _numbers_in(mirror: Symmetry, size: int) -> np.ndarray:
+    """Which number of an observation is seen in place of each; the ego's is the shorter one."""
+    return np.argsort(mirror.observation[:size])
 
 
 def make_population(

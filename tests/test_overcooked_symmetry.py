@@ -10,6 +10,7 @@ from envs.base import Pair
 from envs.overcooked import dynamics
 from envs.overcooked.layouts import CLASSIC, STYLED
 from haland_jax import networks, partners
+from haland_jax.normalisation import Normaliser
 
 # By kitchen: the mirror of a place, and whether onions are tomatoes in it. Worked out by hand.
 MIRRORS = {
@@ -153,4 +154,52 @@ def test_a_mirrored_partner_does_in_the_mirror_what_the_partner_does():
                 np.asarray(actor.apply(mirrored, seen))[:, mirror.actions],
                 actor.apply(own, observations),
                 atol=1e-6,
+            )
+
+
+def test_a_mirrored_ego_does_and_expects_in_the_mirror_what_the_ego_does():
+    env = envs.make("overcooked/diverse_orders")
+    (mirror,) = env.symmetries
+    actor, critic = networks.MLPActor(env.num_actions.ego), networks.MLPCritic()
+    # The ego does not see the partner's task, with which the partner's observation ends.
+    size = env.observation_sizes.ego
+    assert size < env.observation_sizes.partner
+    observations = jax.random.normal(jax.random.key(0), (5, size))
+    seen = jnp.zeros_like(observations).at[:, mirror.observation[:size]].set(observations)
+    keys = jax.random.split(jax.random.key(1), (8, 2))
+    egos = partners.Player(
+        *(
+            jax.vmap(jax.vmap(lambda key, network=network: network.init(key, observations[0])))(
+                keys
+            )
+            for network in (actor, critic)
+        ),
+        Normaliser(
+            mean=jax.random.normal(jax.random.key(2), (8, 2, size)),
+            variance=jnp.ones((8, 2, size)),
+            count=jnp.ones((8, 2)),
+        ),
+    )
+    images = partners.egos_seen_in(mirror, egos)
+    for style, image in enumerate(mirror.styles):
+        for seed in range(2):
+            own, mirrored = (
+                jax.tree.map(lambda leaf, at=(number, seed): leaf[at], players)
+                for players, number in ((egos, style), (images, image))
+            )
+            np.testing.assert_allclose(
+                np.asarray(actor.apply(mirrored.actor, seen))[:, mirror.actions],
+                actor.apply(own.actor, observations),
+                atol=1e-6,
+            )
+            np.testing.assert_allclose(
+                critic.apply(mirrored.critic, seen),
+                critic.apply(own.critic, observations),
+                atol=1e-6,
+            )
+            np.testing.assert_array_equal(
+                seen - mirrored.normaliser.mean,
+                jnp.zeros_like(seen)
+                .at[:, mirror.observation[:size]]
+                .set(observations - own.normaliser.mean),
             )

@@ -28,7 +28,7 @@ from experiments import (
 )
 from experiments.pipeline import run_pipeline
 from experiments.stages import STAGES
-from experiments.stages.best_responses import OWN, UNIVERSAL
+from experiments.stages.best_responses import IMAGE, OWN, UNIVERSAL
 from haland_jax.universal import VARIANTS
 
 pytestmark = [pytest.mark.slow, pytest.mark.timeout(1500)]
@@ -81,7 +81,14 @@ def test_results_hold_every_method_style_and_held_out_seed(results):
         assert curve == (config.num_seeds, len(results["curves"]["steps"]))
     starts = results["best_responses"]
     assert set(starts["starts"]) == set(styles)
-    assert set(starts["starts"].values()) <= set(starts["start_returns"]) == {OWN, UNIVERSAL}
+    assert (
+        set(starts["starts"].values())
+        <= set(starts["start_returns"])
+        == {
+            *(OWN, UNIVERSAL),
+            *(IMAGE.format(start) for start in (OWN, UNIVERSAL)),
+        }
+    )
     assert np.shape(starts["kept_egos"]) == (8, config.train_seeds)
     for returns in starts["start_returns"].values():
         assert np.shape(returns) == (8, config.train_seeds)

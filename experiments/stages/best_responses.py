@@ -23,6 +23,8 @@ from haland_jax.universal import start_variants
 
 OWN, UNIVERSAL = "own ego", "universal ego"
 """Where the refits of best responses start."""
+IMAGE = "mirror image of {}"
+"""The same of another style's refits, as they look in a mirror."""
 
 
 class Archive(PyTreeNode):
@@ -65,7 +67,8 @@ def _refit_egos(
         key = jax.random.fold_in(choice_key, 1)
         universal, of_universal = _universal_to_refit(run, key, teachers)
         starts[UNIVERSAL] = partners.copies(universal, config.train_seeds)
-    refitted, done = [], 0
+    refitted: dict[str, Player] = {}
+    done = 0
     for (name, egos), training in zip(starts.items(), config.refits, strict=True):
         refit = partial(best_responses.best_response_refits, env, training, refit_key)
         trained, _ = train_population(
@@ -77,20 +80,34 @@ def _refit_egos(
             lambda updates, metrics, before=done: task.update(before + updates, metrics),
             f"best responses from the {name}",
         )
-        refitted.append(partners.unflatten(trained.ego, len(env.style_names)))
+        own = partners.unflatten(trained.ego, len(env.style_names))
+        refitted |= _images(run, name, own) | {name: own}
         done += training.num_updates
-    egos = jax.tree.map(lambda *parts: jnp.concatenate(parts, axis=1), *refitted)
+    egos = jax.tree.map(lambda *parts: jnp.concatenate(parts, axis=1), *refitted.values())
     returns = _returns_with_all(run, choice_key, egos.actor, teachers).reshape(
-        len(env.style_names), len(starts), config.train_seeds
+        len(env.style_names), len(refitted), config.train_seeds
     )
     kept, places = best_responses.best_egos(egos, returns)
-    names, chosen = list(starts), places[:, 0] // config.train_seeds
+    names, chosen = list(refitted), places[:, 0] // config.train_seeds
     return kept, {
         "starts": {style: names[i] for style, i in zip(env.style_names, chosen, strict=True)},
         "start_returns": {name: returns[:, index] for index, name in enumerate(names)},
         "kept_egos": places % config.train_seeds,
         **of_universal,
     }
+
+
+def _images(run: Run, start: str, egos: Player) -> dict[str, Player]:
+    """What refits [style, seed] are for other styles in the mirrors, where they learnt with images.
+
+    An ego may have found out what its image has not, at no cost in steps.
+    """
+    if not run.config.partners.mirror:
+        return {}
+    images = [partners.egos_seen_in(mirror, egos) for mirror in run.env.symmetries]
+    name = IMAGE.format(start)
+    numbers = [""] if len(images) == 1 else [f" {i + 1}" for i in range(len(images))]
+    return {f"{name}{number}": one for number, one in zip(numbers, images, strict=True)}
 
 
 def _universal_to_refit(
