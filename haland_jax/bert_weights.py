@@ -165,7 +165,7 @@ def load_tokenizer(source: str | None = None) -> PreTrainedTokenizerBase:
 
 
 def tokenize(
-    tokenizer: PreTrainedTokenizerBase, sentences: Sequence[str], maximum_length: int = 32
+    tokenizer: PreTrainedTokenizerBase, sentences: Sequence[str], maximum_length: int = 40
 ) -> tuple[np.ndarray, np.ndarray]:
     """Token ids int32 [B, maximum_length] and mask bool [B, maximum_length] of sentences.
 

@@ -52,7 +52,7 @@ class TranslatorConfig:
     Raises ValueError if a value is out of its range.
     """
 
-    maximum_length: int = 32
+    maximum_length: int = 40
     pooling: Pooling = "mean"
     trainable_layers: int = 3
     dropout: float = 0.1

@@ -51,8 +51,9 @@ def write(folder: Path, text: str) -> Path:
 def test_every_style_has_as_many_training_and_test_sentences(environment):
     instructions = load_instructions(environment, STYLES[environment])
     assert tuple(instructions) == STYLES[environment]
+    (number,) = {len(sentences.train) for sentences in instructions.values()}
+    assert number == (100 if environment.endswith("diverse_coordination") else 40)
     for style, sentences in instructions.items():
-        assert len(sentences.train) == 40, style
         assert len(sentences.test) == 4, style
 
 
@@ -71,10 +72,13 @@ def test_sentences_name_what_their_style_is_about(environment):
         "right": ("right",),
         "upper": ("upper", "top", "above", " up ", "up "),
         "lower": ("lower", "bottom", "below", "down"),
-        "onion": ("onion",),
+        "onion": ("onion", "veg"),
         "tomato": ("tomato",),
-        "dish": ("dish", "plate"),
-        "delivery": ("serv", "deliver", "hand in", "to the window", "carrying soup out", "pass"),
+        "dish": ("dish", "plate", "bowl", "crockery", "tableware", "porcelain"),
+        "delivery": (
+            *("serv", "deliver", "hand in", "window", "carry", "carried", "pass", "bring"),
+            *("brought", "waiter", "runner", "customer", "guest", "hand the soups in"),
+        ),
         "deliver": ("serv", "deliver", "bring", "carry soup", "hand in", "waiter", "drop"),
         "1": ("1", "one", "first", "leftmost"),
         "2": ("2", "two", "second"),

@@ -279,7 +279,7 @@ def tokenizer():
 
 def test_token_ids_are_padded_and_masked(tokenizer):
     token_ids, mask = tokenize(tokenizer, ["Stay left.", "No onions for me, please."])
-    assert token_ids.shape == mask.shape == (2, 32)
+    assert token_ids.shape == mask.shape == (2, 40)
     assert token_ids.dtype == np.int32
     np.testing.assert_array_equal(mask.sum(-1), [5, 9])  # words, full stops, two markers
     assert (token_ids[~mask] == tokenizer.pad_token_id).all()
@@ -293,9 +293,9 @@ def test_a_blank_sentence_is_refused(tokenizer, sentence):
 
 
 def test_the_longest_sentence_passes_and_a_longer_one_is_refused(tokenizer):
-    assert tokenize(tokenizer, ["left " * 30])[1].all()
-    with pytest.raises(ValueError, match=r"33 word pieces .* maximum is 32"):
-        tokenize(tokenizer, ["left " * 31])
+    assert tokenize(tokenizer, ["left " * 38])[1].all()
+    with pytest.raises(ValueError, match=r"41 word pieces .* maximum is 40"):
+        tokenize(tokenizer, ["left " * 39])
 
 
 def test_a_sentence_without_a_known_word_is_refused(tokenizer):
