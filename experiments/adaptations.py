@@ -71,8 +71,12 @@ _TOLD_START = dataclasses.replace(_UNIVERSAL_START, told_start=True)
 ADAPTATIONS = {
     # Pairs that begin at the same pot keep to it, and so do refits of their egos, beside partners
     # that would serve both; an ego that has met all styles knows better. Whether it finds the
-    # second pot in every style is chance, so that there are two of them to choose from.
-    "overcooked/center_pots": Adaptation(presets={"quick": _UNIVERSAL_START}),
+    # second pot in every style is chance, so that there are two of them to choose from. Nor does it
+    # always find out in the lower corners that it pays to fill the partner's pot twice as often as
+    # its own; a refit with much noise at first often does.
+    "overcooked/center_pots": Adaptation(
+        refit={"entropy": 0.1}, presets={"quick": _UNIVERSAL_START}
+    ),
     # Both players must learn to give way.
     "overcooked/crossway": Adaptation(
         length=1.7,
