@@ -25,7 +25,7 @@ from haland_jax.translation_vae import TranslationVAE, translation_loss
 
 Params = Any
 
-FINE_TUNING = FitConfig(learning_rate=1e-4, steps=200, warmup_steps=10)
+FINE_TUNING = FitConfig(learning_rate=1e-4, steps=600, warmup_steps=10)
 TRANSLATION = FitConfig(learning_rate=1e-4, steps=300, warmup_steps=20)
 
 
@@ -57,7 +57,7 @@ class TranslatorConfig:
     trainable_layers: int = 3
     dropout: float = 0.1
     word_piece_dropout: float = 0.05
-    fine_tunings: int = 4
+    fine_tunings: int = 1
     classifier_rate: float = 30.0
     fine_tuning_batch: int = 24
     translation_batch: int = 80
