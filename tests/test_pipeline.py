@@ -215,7 +215,7 @@ def test_sight_refuses_what_is_no_distance(capsys, monkeypatch, smoke_run):
 
 
 def test_a_sentence_must_hold_words_and_not_too_many(capsys, monkeypatch, smoke_run):
-    for sentence, message in (("  ", "blank"), ("onion " * 60, "32")):
+    for sentence, message in (("  ", "blank"), ("onion " * 60, "the maximum is 40")):
         line = refused(capsys, monkeypatch, generate, "--run", smoke_run, sentence)
         assert message in line
 
