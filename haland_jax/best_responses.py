@@ -7,7 +7,7 @@
    It is the one that is told the style, unless that earns clearly less (`choose_universal`) and
    the other may be it (`PartnersConfig.told_start`).
    What a style's egos have found out, those of the style that is seen in its place in a mirror may
-   have missed: their images (`partners.egos_seen_in`) are taken where they are clearly better.
+   have missed: their images (`mirrors.egos_seen_in`) are taken where they are clearly better.
    Each style keeps the universal start, unless its own egos are clearly better, and of that start
    the egos that are as good (`best_egos`). These egos are the archive.
 2. The Oracle of a held-out partner is the best of a few egos of its style refitted to that very

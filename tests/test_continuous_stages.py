@@ -14,7 +14,7 @@ from experiments.stages import Run, context, load_archive, load_population
 from experiments.stages.best_responses import _universal_to_refit, make_best_responses
 from experiments.stages.population import make_partners
 from experiments.stages.universal import load_universal, train_universal
-from haland_jax import partners
+from haland_jax import mirrors, partners
 from haland_jax.partners import PartnersConfig
 from haland_jax.ppo_loss import PPOConfig
 from haland_jax.universal import TOLD_THE_STYLE, UniversalConfig
@@ -112,7 +112,7 @@ def test_best_responses_may_start_from_the_told_ego_alone(run, told_start, egos)
     known = dataclasses.replace(made.config.partners, told_start=told_start)
     asked = Run(dataclasses.replace(made.config, partners=known), made.folder)
     population = load_population(made)
-    teachers = partners.teachers(made.env, known, population)
+    teachers = mirrors.teachers(made.env, known, population)
     start, chosen = _universal_to_refit(asked, jax.random.key(0), teachers)
     assert np.shape(chosen["universal_start_returns"]) == (len(made.env.style_names), egos)
     if told_start:

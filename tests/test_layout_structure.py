@@ -20,6 +20,7 @@ ORDER = (
     "ppo",
     "seeds",
     "partners",
+    "mirrors",
     "universal",
     "recurrent",
     "recurrent_egos",

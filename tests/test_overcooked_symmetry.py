@@ -9,7 +9,7 @@ import envs
 from envs.base import Pair
 from envs.overcooked import dynamics
 from envs.overcooked.layouts import CLASSIC, STYLED
-from haland_jax import networks, partners
+from haland_jax import mirrors, networks, partners
 from haland_jax.normalisation import Normaliser
 
 # By kitchen: the mirror of a place, and whether onions are tomatoes in it. Worked out by hand.
@@ -139,7 +139,7 @@ def test_a_mirrored_partner_does_in_the_mirror_what_the_partner_does():
     policies = jax.vmap(jax.vmap(lambda key: actor.init(key, observations[0])))(
         jax.random.split(jax.random.key(1), (8, 2))
     )
-    both = partners.with_mirror_images(env, policies)
+    both = mirrors.with_mirror_images(env, policies)
     assert jax.tree.leaves(both)[0].shape[:2] == (8, 4)
     seen = jnp.zeros_like(observations).at[:, mirror.observation].set(observations)
     for style, image in enumerate(mirror.styles):
@@ -180,7 +180,7 @@ def test_a_mirrored_ego_does_and_expects_in_the_mirror_what_the_ego_does():
             count=jnp.ones((8, 2)),
         ),
     )
-    images = partners.egos_seen_in(mirror, egos)
+    images = mirrors.egos_seen_in(mirror, egos)
     for style, image in enumerate(mirror.styles):
         for seed in range(2):
             own, mirrored = (

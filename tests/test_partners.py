@@ -11,7 +11,7 @@ from toy_game import ToyGame, always
 
 from experiments.configs import CompressionConfig
 from experiments.stages.model import Visits
-from haland_jax import best_responses, partners
+from haland_jax import best_responses, mirrors, partners
 from haland_jax.partners import PartnersConfig, Player
 from haland_jax.ppo import PPOConfig
 from haland_jax.seeds import (
@@ -190,7 +190,7 @@ def test_the_population_holds_the_chosen_pairs(pairs, population):
 
 def refits(game, population, egos=None, training=CONFIG.refit):
     egos = population.train_egos if egos is None else egos
-    everyone = partners.teachers(game, CONFIG, population)
+    everyone = mirrors.teachers(game, CONFIG, population)
     return best_responses.best_response_refits(game, training, jax.random.key(1), egos, everyone)
 
 

@@ -16,7 +16,7 @@ from experiments.compared import PLAYER_STAGES, PLAYERS
 from experiments.errors import UserError
 from experiments.finished_run import configuration_from, open_run
 from experiments.stages import load_archive, load_population, load_task_language
-from haland_jax import partners
+from haland_jax import mirrors
 
 DOCS = Path(__file__).parent.parent / "docs"
 EXAMPLE = DOCS / "examples" / "retrieval.py"
@@ -52,7 +52,7 @@ def test_partners_and_best_responses_are_those_of_the_run(recorded, restored):
         np.testing.assert_array_equal(getattr(after, name), getattr(before, name))
     assert_near(after.held_out_partners, before.held_out_partners)
     teachers = [
-        partners.teachers(run.env, run.config.partners, population)
+        mirrors.teachers(run.env, run.config.partners, population)
         for run, population in ((was, before), (now, after))
     ]
     assert_near(*teachers)

@@ -89,7 +89,10 @@ def test_from_consent_to_thanks(browser, study):
     page = browser.new_page()
     said = []
     page.on("pageerror", lambda error: said.append(str(error)))
-    page.on("console", lambda message: said.append(message.text))
+    page.on(
+        "console",
+        lambda message: message.type in ("error", "warning") and said.append(message.text),
+    )
     page.goto(address)
     page.click("text=Take part")
     page.check("input[name=agree]")

@@ -16,7 +16,7 @@ import jax
 from experiments.progress import StageProgress
 from experiments.stages import Run, load_archive, load_population
 from experiments.training import Saver
-from haland_jax import checkpoint, partners
+from haland_jax import checkpoint, mirrors
 from haland_jax.networks import Policy
 from haland_jax.partners import Player
 from haland_jax.ppo_loss import PPOConfig
@@ -91,7 +91,7 @@ class Given:
     @property
     def partners(self) -> Policy:
         """Actors of all partners that the run's egos learn with, leading axes [style, partner]."""
-        return partners.teachers(self.env, self.run.config.partners, load_population(self.run))
+        return mirrors.teachers(self.env, self.run.config.partners, load_population(self.run))
 
     @property
     def best_responses(self) -> Player:

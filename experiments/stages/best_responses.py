@@ -14,7 +14,7 @@ from experiments.stages.context import Run
 from experiments.stages.population import load_population, mean_returns
 from experiments.stages.universal import load_universal
 from experiments.training import Saver, train_population
-from haland_jax import best_responses, checkpoint, partners, task_language
+from haland_jax import best_responses, checkpoint, mirrors, partners, task_language
 from haland_jax.networks import Policy
 from haland_jax.partners import Player, Population
 from haland_jax.seeds import all_pairs
@@ -61,7 +61,7 @@ def _refit_egos(
 ) -> tuple[Player, dict[str, Any]]:
     """The archive's egos [style, train_seeds], and what each start brought them."""
     config, env = run.config.partners, run.env
-    teachers = partners.teachers(env, config, population)
+    teachers = mirrors.teachers(env, config, population)
     starts, of_universal = {OWN: population.train_egos}, {}
     if config.universal_start:
         key = jax.random.fold_in(choice_key, 1)
@@ -104,7 +104,7 @@ def _images(run: Run, start: str, egos: Player) -> dict[str, Player]:
     """
     if not run.config.partners.mirror:
         return {}
-    images = [partners.egos_seen_in(mirror, egos) for mirror in run.env.symmetries]
+    images = [mirrors.egos_seen_in(mirror, egos) for mirror in run.env.symmetries]
     name = IMAGE.format(start)
     numbers = [""] if len(images) == 1 else [f" {i + 1}" for i in range(len(images))]
     return {f"{name}{number}": one for number, one in zip(numbers, images, strict=True)}

@@ -20,6 +20,7 @@ from haland_jax import (
     checkpoint,
     diffusion,
     fit,
+    mirrors,
     partners,
     policy_vae,
     rollout,
@@ -104,7 +105,7 @@ class Visits:
 
     def __init__(self, run: Run, population: Population):
         self.run = run
-        self.teachers = partners.teachers(run.env, run.config.partners, population)
+        self.teachers = mirrors.teachers(run.env, run.config.partners, population)
         wanted = run.config.compression
         most = max(wanted.own_states, wanted.other_states, wanted.decoded_states)
         steps = jax.tree.leaves(self.teachers)[0].shape[1] * run.config.max_steps

@@ -10,7 +10,7 @@ from experiments.progress import StageProgress
 from experiments.stages.context import Run
 from experiments.stages.population import load_population
 from experiments.training import Saver, curves_of, train_population
-from haland_jax import checkpoint, partners, universal
+from haland_jax import checkpoint, mirrors, universal
 from haland_jax.learner import TrainState
 from haland_jax.partners import Player
 
@@ -57,7 +57,7 @@ def train_universal_in(
 def _start(run: Run, env: Labelled) -> TrainState:
     """The egos before they learn; the egos of pairs guide them, where anybody does."""
     config, population = run.config.universal, load_population(run)
-    teachers = partners.teachers(run.env, run.config.partners, population)
+    teachers = mirrors.teachers(run.env, run.config.partners, population)
     guides = population.best_train_egos.actor if config.training.guidance else None
     return universal.init_universal(env, config, run.key(STAGE), teachers, guides)
 
