@@ -37,6 +37,11 @@ class Estimate(NamedTuple):
         """For a reader: 0.98 [0.96, 0.99]."""
         return f"{self.value:.2f} [{self.low:.2f}, {self.high:.2f}]"
 
+    @property
+    def signed(self) -> str:
+        """The same as a difference: +0.04 [-0.01, +0.09]."""
+        return f"{self.value:+.2f} [{self.low:+.2f}, {self.high:+.2f}]"
+
     def overlaps(self, other: "Estimate") -> bool:
         """Whether the two intervals have a point in common."""
         return self.low <= other.high and other.low <= self.high

@@ -261,10 +261,9 @@ def _standings(results: Mapping[str, Any]) -> str:
     for one in found:
         steps = "–" if one.steps is None else steps_in_words(one.steps)
         budget = "–" if one.budget is None else f"{one.budget:.0%}"
-        lead = f"{one.lead.value:+.2f} [{one.lead.low:+.2f}, {one.lead.high:+.2f}]"
         means = f"{one.mean:.2f} ({one.lowest:.2f})"
         verdict = f"**{one.verdict}**"
-        rows.append((one.method, str(one.share), means, lead, verdict, steps, budget))
+        rows.append((one.method, str(one.share), means, one.lead.signed, verdict, steps, budget))
     head = (
         *("method", "return / Oracle, IQM (95%)", "mean (lowest style)", "Haland's lead (95%)"),
         *("Haland is", "steps", "of all best responses'"),

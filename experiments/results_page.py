@@ -7,7 +7,7 @@ from experiments.intervals import Estimate
 from experiments.markdown import table
 from experiments.overview import Overview, number, percent
 from experiments.run_all import ALL, default_path
-from experiments.standing import improvement_in_words, in_order
+from experiments.standing import PLACES, improvement_in_words, in_order
 from experiments.summary import COMPARISONS, HEADLINE
 from experiments.worth import steps_in_words
 
@@ -281,13 +281,11 @@ def _beside(row: Overview) -> str:
     """Haland beside the best universal ego, in a sentence."""
     best = row.best_ego
     assert best is not None
-    where = {"ahead": "ahead of", "behind": "behind", "level": "level with"}[best.verdict]
     budget = "" if best.budget is None else f", {best.budget:.0%} of those of all best responses"
     steps = "" if best.steps is None else f" ({steps_in_words(best.steps)} steps{budget})"
-    lead = best.lead
     return (
-        f"Haland is {where} {best.method}{steps}: {row.means[HEADLINE][0]:.2f} and {best.mean:.2f} "
-        f"of the Oracle in the mean, {lead.value:+.2f} [{lead.low:+.2f}, {lead.high:+.2f}]. The "
+        f"Haland is {PLACES[best.verdict]} {best.method}{steps}: {row.means[HEADLINE][0]:.2f} and "
+        f"{best.mean:.2f} of the Oracle in the mean, {best.lead.signed}. The "
         f"intervals of the interquartile means {'are apart' if best.apart else 'overlap'}."
     )
 

@@ -36,6 +36,10 @@ _OWN = (*(name for name in METHODS if name != HEADLINE), *FURTHER_ABLATIONS)
 Results = Mapping[str, Any]
 
 
+PLACES = {"ahead": "ahead of", "behind": "behind", "level": "level with"}
+"""What `verdict_of` says, in a sentence before the other one's name."""
+
+
 class Standing(NamedTuple):
     """Another method beside Haland, in one run.
 

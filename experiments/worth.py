@@ -6,7 +6,7 @@ from typing import Any
 import numpy as np
 
 from experiments.intervals import mean_estimate
-from experiments.standing import verdict_of, without_memory
+from experiments.standing import PLACES, verdict_of, without_memory
 from experiments.summary import (
     BEST_RESPONSE,
     HEADLINE,
@@ -75,10 +75,9 @@ def _for_one_ego(results: Mapping[str, Any], rows: Mapping[str, MethodSummary]) 
     if ahead in rows:
         best = max(plain, told, key=lambda row: row.ratio)
         lead = mean_estimate(ratios(results, ahead) - ratios(results, best.method))
-        place = {"ahead": "ahead of", "level": "level with", "behind": "behind"}[verdict_of(lead)]
         said.append(
-            f"{ahead} ({rows[ahead].ratio:.0%}) is {place} the better of the two: "
-            f"{lead.value:+.2f} [{lead.low:+.2f}, {lead.high:+.2f}] of the Oracle."
+            f"{ahead} ({rows[ahead].ratio:.0%}) is {PLACES[verdict_of(lead)]} the better of the "
+            f"two: {lead.signed} of the Oracle."
         )
     return said
 

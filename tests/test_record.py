@@ -224,6 +224,7 @@ def drawn(monkeypatch):
     def draw(results, folder) -> list[Path]:
         file = Path(folder) / "cross_play.png"
         picture(file)
+        file.with_suffix(".pdf").write_bytes(b"%PDF")
         return [file] if "cross_play" in results else []
 
     monkeypatch.setattr(record, "draw_figures", draw)
@@ -254,9 +255,8 @@ def test_a_run_is_recorded_with_pictures_and_links_that_work(tmp_path, readme):
         assert kept.size == (60, 40)
         assert kept.mode == "P"
     text = readme.read_text()
-    assert text.startswith(
-        "# Title\n\nbefore\n\n<!-- results -->\n\nPreset `quick`: from sentences it was not"
-    )
+    before = "# Title\n\nbefore\n\n<!-- results -->\n\nPreset `quick`: "
+    assert text.startswith(f"{before}from sentences it was not trained on")
     assert text.endswith("\n\n<!-- /results -->\n\nafter\n")
     assert "docs/results/overcooked/crossway/report.md" in text
 
