@@ -34,7 +34,7 @@ class Arguments:
     """Make an agent from one sentence and play an episode with a held-out partner."""
 
     sentence: tyro.conf.Positional[str]
-    """How the partner likes to work, in plain words (at most 32 word pieces)."""
+    """How the partner likes to work, in plain words, about 25 of them at most."""
     run: Annotated[str, tyro.conf.arg(metavar="FOLDER|pretrained:ENV")] = DEFAULT_MODEL
     """Folder of a finished run, or a model that comes with the package."""
     style: Annotated[str | None, tyro.conf.arg(metavar="NAME")] = None

@@ -22,7 +22,8 @@ class Generation(PyTreeNode):
     Attributes:
         policy: the ego's actor.
         latent: z, float32 [D].
-        v_hat: the task language that the sentence was translated to, float32 [U].
+        v_hat: the task language that the sentence was translated to, drawn to the styles
+            (`task_language.drawn_to_styles`), float32 [U].
         style_logits: the translator's classification, float32 [style]; for display alone.
     """
 
@@ -62,7 +63,7 @@ class Haland:
     def __post_init__(self):
         vae = PolicyVAE(self.architecture, self.vae_config)
         config, translator_config = self.diffusion_config, self.translator.config
-        bert = self.translator.architecture
+        bert, styles = self.translator.architecture, self.v_hat
 
         def from_task_language(params, key, v_hat, sampler):
             vae_params, diffusion_params, _ = params
@@ -71,9 +72,10 @@ class Haland:
 
         def from_tokens(params, key, token_ids, mask, sampler):
             translate = Translator(params[2], bert, translator_config)
-            v_hat, logits = translate(token_ids[None], mask[None])
-            policy, latent = from_task_language(params, key, v_hat[0], sampler)
-            return Generation(policy, latent, v_hat[0], logits[0])
+            translated, logits = translate(token_ids[None], mask[None])
+            v_hat = task_language.drawn_to_styles(translated[0], styles)
+            policy, latent = from_task_language(params, key, v_hat, sampler)
+            return Generation(policy, latent, v_hat, logits[0])
 
         many = jax.vmap(from_task_language, in_axes=(None, 0, 0, None))
         programs = {
@@ -96,7 +98,7 @@ class Haland:
         """Generates a policy from a sentence and tells what it was made from.
 
         Args:
-            sentence: at most 32 word pieces.
+            sentence: at most `translator.config.maximum_length` word pieces.
             key: consumed; another key gives another sample.
             sampler: `ddim` (fast) or `ddpm` (Eq. 1, all N steps).
 
@@ -106,13 +108,27 @@ class Haland:
         token_ids, mask = self._tokens([sentence])
         return self._programs["from_tokens"](self.params, key, token_ids[0], mask[0], sampler)
 
-    def translate(self, sentences: Sequence[str]) -> tuple[jax.Array, jax.Array]:
-        """Returns the sentences' task language [B, U] and style logits [B, style].
+    def translate(
+        self, sentences: Sequence[str], *, drawn: bool = True
+    ) -> tuple[jax.Array, jax.Array]:
+        """Translates sentences, for `generate_from_task_language`.
+
+        Args:
+            sentences: B of them.
+            drawn: whether translations are drawn to the styles (`task_language.drawn_to_styles`),
+                as `generate` does it; without that it is what the translator says.
+
+        Returns:
+            Task language [B, U] and style logits [B, style].
 
         Raises:
             ValueError: a sentence is blank or too long.
         """
-        return self._programs["translate"](self.translator, *self._tokens(sentences))
+        translate = self._programs["translate"]
+        translated, logits = translate(self.translator, *self._tokens(sentences))
+        if drawn:
+            translated = task_language.drawn_to_styles(translated, self.v_hat)
+        return translated, logits
 
     def generate_from_task_language(
         self, v_hat: jax.Array, keys: jax.Array, *, sampler: str = "ddim"

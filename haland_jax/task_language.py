@@ -20,6 +20,11 @@ BINS = 10
 SLACK = 1e-4
 """δ of Eq. 8, which keeps a frequency of 1 in the last bin; App. D gives no value."""
 
+TRANSLATION_ERROR = 1 / 3
+"""How far from its style a translation is expected: standard deviation in each dimension, as a
+share of the distance between the two styles that are most alike. Not in the paper; what it brings
+is in docs/paper_map.md."""
+
 
 class TaskLanguage(PyTreeNode):
     """The task language of one environment.
@@ -196,6 +201,30 @@ def nearest_style(v_hat: Array, style_v_hat: Array) -> Array:
     """
     squared = jnp.sum(jnp.square(v_hat[..., None, :] - style_v_hat), axis=-1)
     return jnp.argmin(squared, axis=-1).astype(jnp.int32)
+
+
+def drawn_to_styles(v_hat: Array, style_v_hat: Array, error: float = TRANSLATION_ERROR) -> Array:
+    """What style a translation means, as the task language that is expected given it.
+
+    A translation is taken for the task language of one of the styles, all equally probable, plus a
+    normal error. Near a style that gives the style's own task language, between two styles mostly
+    that of the nearer one. The diffusion has met no other condition in training.
+
+    Args:
+        v_hat: translations, [..., U].
+        style_v_hat: [style, U].
+        error: standard deviation of the error in each dimension, as a share of the distance
+            between the two styles that are most alike, > 0.
+
+    Returns:
+        [..., U], a mean of the styles' rows weighted by their probabilities.
+    """
+    between = jnp.linalg.norm(style_v_hat[:, None] - style_v_hat, axis=-1)
+    closest = jnp.min(between, where=~jnp.eye(len(style_v_hat), dtype=bool), initial=jnp.inf)
+    # Styles without a difference would make the error 0.
+    deviation = jnp.maximum(error * closest, 1e-6)
+    squared = jnp.sum(jnp.square(v_hat[..., None, :] - style_v_hat), axis=-1)
+    return jax.nn.softmax(-0.5 * squared / jnp.square(deviation), axis=-1) @ style_v_hat
 
 
 def jittered(key: Array, v_hat: Array, amplitude: float) -> Array:

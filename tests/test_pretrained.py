@@ -16,7 +16,15 @@ from experiments import devices, export, generate
 from experiments.errors import UserError
 from experiments.evaluate import measure
 from experiments.models import instructions_of, open_model
-from haland_jax import bert_weights, checkpoint, compact, networks, policy_vae, pretrained
+from haland_jax import (
+    bert_weights,
+    checkpoint,
+    compact,
+    networks,
+    policy_vae,
+    pretrained,
+    task_language,
+)
 from haland_jax.pretrained import BundleError
 
 SHIPPED = pretrained.names()
@@ -122,12 +130,26 @@ def test_a_bundle_gives_back_its_model(smoke_bundle):
             # Half a step of the largest magnitude, or half precision.
             np.testing.assert_allclose(a, b, rtol=1e-3, atol=0.51 / 127 * float(np.abs(b).max()))
     sentences = ["I stay on the left.", "No dishes for me."]
-    difference = found.haland.translate(sentences)[0] - model.haland.translate(sentences)[0]
+    now, before = (m.haland.translate(sentences, drawn=False)[0] for m in (found, model))
+    difference = now - before
     assert 0 < float(jnp.abs(difference).max()) < 0.02
     assert sum(sizes.values()) < 12 * MEGABYTE
     assert sum(sizes.values()) == pytest.approx(
         (folder / pretrained.ARRAYS).stat().st_size, rel=0.01
     )
+
+
+def test_the_translation_that_generates_is_drawn_to_the_styles(smoke_bundle):
+    haland, sentence = smoke_bundle[0].haland, "I stay on the left."
+    translated, logits = haland.translate([sentence], drawn=False)
+    drawn = task_language.drawn_to_styles(translated, haland.v_hat)
+    assert float(jnp.abs(drawn - translated).max()) > 0.01
+    np.testing.assert_allclose(haland.translate([sentence])[0], drawn, atol=1e-6)
+    made = haland.explain(sentence, jax.random.key(0))
+    np.testing.assert_allclose(made.v_hat, drawn[0], atol=1e-4)
+    np.testing.assert_allclose(made.style_logits, logits[0], atol=1e-4)
+    _, latents = haland.generate_from_task_language(drawn, jax.random.key(0)[None])
+    np.testing.assert_allclose(made.latent, latents[0], atol=0.01)
 
 
 def test_generated_policies_act_as_the_models(smoke_bundle):

@@ -10,6 +10,7 @@ from haland_jax.task_language import (
     agent_event_names,
     build_label_language,
     build_task_language,
+    drawn_to_styles,
     event_frequencies,
     jittered,
     nearest_style,
@@ -92,6 +93,21 @@ def test_nearest_style():
     queries = jnp.array([[0.1, 0.8], [0.9, 0.3], [0.6, 0.5]])
     np.testing.assert_array_equal(nearest_style(queries, styles), [0, 1, 2])
     assert int(nearest_style(queries[1], styles)) == 1
+
+
+def test_translations_are_drawn_to_the_styles_by_hand():
+    # The two styles that are most alike are 3 apart: the error's standard deviation is 1.
+    styles = jnp.array([[0.0, 0.0], [3.0, 0.0], [0.0, 9.0]])
+    drawn = np.asarray(drawn_to_styles(jnp.array([[1.0, 0.0], [0.2, -0.1], [1.5, 0.0]]), styles))
+    # Squared distances 1 and 4 from the first two; the third is too far to count.
+    weight = np.exp(-2.0) / (np.exp(-0.5) + np.exp(-2.0))
+    np.testing.assert_allclose(drawn[0], [3.0 * weight, 0.0], atol=1e-5)
+    np.testing.assert_allclose(drawn[1], [0.0, 0.0], atol=0.06)
+    np.testing.assert_allclose(drawn[2], [1.5, 0.0], atol=1e-5)  # No guess where it is even.
+    np.testing.assert_allclose(drawn_to_styles(styles, styles), styles, atol=0.04)
+    np.testing.assert_array_equal(
+        drawn_to_styles(jnp.array([[0.5, 0.4]]), jnp.ones((2, 2))), jnp.ones((1, 2))
+    )
 
 
 def test_sinusoidal_labels_by_hand():

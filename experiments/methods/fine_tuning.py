@@ -71,11 +71,13 @@ class WithoutFineTuning:
 
 
 def _translations(haland: Haland, run: Run) -> dict[str, Any]:
-    """Task language of all sentences by what they are for, [style, sentence, U]."""
+    """What the translator says of all sentences, by what they are for, [style, sentence, U]."""
     instructions = run.instructions().values()
     spoken = {"train": [s.train for s in instructions], "test": [s.test for s in instructions]}
 
     def translate(sentences: Any) -> jax.Array:
-        return jnp.stack([haland.translate(list(of_style))[0] for of_style in sentences])
+        return jnp.stack(
+            [haland.translate(list(of_style), drawn=False)[0] for of_style in sentences]
+        )
 
     return {what: translate(sentences) for what, sentences in spoken.items()}
