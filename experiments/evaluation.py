@@ -58,7 +58,7 @@ def evaluate(run: Run, task: StageProgress) -> dict[str, Any]:
     egos[TRUE_LANGUAGE], _ = _generate(haland, next(keys), samples, styles)
     instructions = run.instructions()
     spoken = {
-        TRAINING_SENTENCES: [list(style.train) for style in instructions.values()],
+        TRAINING_SENTENCES: [list(style.training_sample()) for style in instructions.values()],
         TEST_SENTENCES: [list(style.test) for style in instructions.values()],
     }
     translated, latents = {}, {}

@@ -43,7 +43,8 @@ _MEANING = {
     "VAE reconstruction": "the same egos after encoding and decoding",
     "Diffusion, true task language": "policies drawn from the diffusion model, given the measured "
     "event frequencies",
-    "Haland, training sentences": "policies from sentences that the translator was trained on",
+    "Haland, training sentences": "policies from sentences that the translator was trained on, at "
+    "most 40 of a style",
     HEADLINE: "policies from sentences that it was not trained on, one sample each: **the "
     "headline**",
     WRONG: "policies from another style's sentence: the control, which must fall",

@@ -5,7 +5,12 @@ from pathlib import Path
 
 import pytest
 
-from envs.instructions import load_instructions, read_instructions, training_sentences
+from envs.instructions import (
+    Instructions,
+    load_instructions,
+    read_instructions,
+    training_sentences,
+)
 
 ORDERS = tuple(f"{soup}_{cell}" for soup in ("onion", "tomato") for cell in (1, 2, 3, 4))
 CORNERS = ("upper_left", "upper_right", "lower_left", "lower_right")
@@ -63,6 +68,13 @@ def test_training_sentences_come_style_by_style(tmp_path):
     wordings, styles = training_sentences(instructions)
     assert wordings == ["Go right.", "Stay right.", "Go left."]
     assert styles == [0, 0, 1]
+
+
+def test_a_sample_of_training_sentences_is_evenly_spread():
+    instructions = Instructions(tuple(str(number) for number in range(9)), ("test",))
+    assert instructions.training_sample(3) == ("0", "4", "8")
+    assert instructions.training_sample(1) == ("0",)
+    assert instructions.training_sample(9) == instructions.training_sample() == instructions.train
 
 
 @pytest.mark.parametrize("environment", sorted(KITCHENS))

@@ -18,6 +18,11 @@ class Instructions(NamedTuple):
     train: tuple[str, ...]
     test: tuple[str, ...]
 
+    def training_sample(self, most: int = 40) -> tuple[str, ...]:
+        """At most so many of `train`, evenly spread, so that every author has a share."""
+        last, count = len(self.train) - 1, min(most, len(self.train))
+        return tuple(self.train[round(i * last / max(count - 1, 1))] for i in range(count))
+
 
 def load_instructions(
     environment_name: str, style_names: Sequence[str] | None = None

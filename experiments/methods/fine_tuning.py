@@ -33,7 +33,7 @@ class WithoutFineTuning:
         return run.config.translator.translation.steps
 
     def train(self, given: Given) -> Trained:
-        """Fits the VAE, and translates all sentences with both translators."""
+        """Fits the VAE, and translates sentences with both translators."""
         run, config = given.run, given.run.config.translator
         language = load_task_language(run)
         encoder, tokenizer = load_pretrained(run)
@@ -71,9 +71,12 @@ class WithoutFineTuning:
 
 
 def _translations(haland: Haland, run: Run) -> dict[str, Any]:
-    """What the translator says of all sentences, by what they are for, [style, sentence, U]."""
+    """What the translator says of sentences, by what they are for, [style, sentence, U]."""
     instructions = run.instructions().values()
-    spoken = {"train": [s.train for s in instructions], "test": [s.test for s in instructions]}
+    spoken = {
+        "train": [s.training_sample() for s in instructions],
+        "test": [s.test for s in instructions],
+    }
 
     def translate(sentences: Any) -> jax.Array:
         return jnp.stack(
