@@ -82,6 +82,8 @@ class RunConfig:
             (stage 2).
         compression: policy VAE (stage 3).
         diffusion: latent diffusion (stage 4).
+        training_sentences: at most so many of each style are used, evenly spread over the packaged
+            ones; 0: all.
         translator: sentence translator (stage 5).
         universal: egos for the partners of all styles, told the style or not (stage 1).
         evaluation: what is measured (stage 6).
@@ -96,9 +98,16 @@ class RunConfig:
     task_language_games: int = 32
     compression: CompressionConfig = dataclasses.field(default_factory=CompressionConfig)
     diffusion: DiffusionConfig = dataclasses.field(default_factory=DiffusionConfig)
+    training_sentences: int = 0
     translator: TranslatorConfig = dataclasses.field(default_factory=TranslatorConfig)
     universal: UniversalConfig = dataclasses.field(default_factory=UniversalConfig)
     evaluation: EvaluationConfig = dataclasses.field(default_factory=EvaluationConfig)
+
+    def __post_init__(self):
+        if self.training_sentences < 0:
+            raise ValueError(
+                f"training_sentences is {self.training_sentences}; expected 0 (all) or more"
+            )
 
 
 def _adapted(config: RunConfig) -> RunConfig:
@@ -190,6 +199,7 @@ def smoke(environment: str, seed: int) -> RunConfig:
             ddim_steps=5,
             clip=8.0,
         ),
+        training_sentences=8,
         translator=TranslatorConfig(
             fine_tunings=2,
             fine_tuning=FitConfig(learning_rate=1e-4, steps=4, warmup_steps=1),

@@ -37,4 +37,5 @@ def with_later_settings(stored: dict[str, Any]) -> dict[str, Any]:
         partners.setdefault("told_start", False)
     if "translator" in filled:
         filled["translator"].setdefault("fine_tunings", 1)
+        filled.setdefault("training_sentences", 0)
     return filled

@@ -24,13 +24,15 @@ def test_every_preset_is_a_run_of_every_environment(environment, preset):
 
 
 def test_where_best_responses_start_from_the_universal_ego_it_learns_for_long():
-    plain = configs.quick("overcooked/diverse_coordination", 0)
+    plain = configs.quick("assistive/jaco", 0)
     assert not plain.partners.universal_start
     kitchen = configs.quick("overcooked/center_pots", 0)
     assert kitchen.partners.universal_start
     assert kitchen.universal.training.total_steps == 40_000_000
-    assert kitchen.partners.refit == dataclasses.replace(plain.partners.refit, entropy=0.1)
-    assert kitchen.partners.universal_refit.learning_rate < plain.partners.refit.learning_rate
+    coordination = configs.quick("overcooked/diverse_coordination", 0).partners
+    assert coordination.told_start
+    assert kitchen.partners.refit == dataclasses.replace(coordination.refit, entropy=0.1)
+    assert kitchen.partners.universal_refit.learning_rate < kitchen.partners.refit.learning_rate
     # Where both learn for a short time, neither may know all styles.
     larger = configs.overnight("overcooked/center_pots", 0)
     crossway = configs.quick("overcooked/crossway", 0)

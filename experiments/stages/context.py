@@ -46,11 +46,18 @@ class Run:
         return jax.random.fold_in(root, STAGE_NAMES.index(stage))
 
     def instructions(self) -> dict[str, Instructions]:
-        """The packaged sentences, in the order of the styles."""
-        return load_instructions(self.config.environment, self.env.style_names)
+        """The packaged sentences, in the order of the styles, of `train` those that it uses."""
+        packaged = load_instructions(self.config.environment, self.env.style_names)
+        most = self.config.training_sentences
+        if not most:
+            return packaged
+        return {
+            style: sentences._replace(train=sentences.training_sample(most))
+            for style, sentences in packaged.items()
+        }
 
     def sentences_digest(self) -> str:
-        """SHA-256 of the packaged training sentences, in the order of the styles."""
+        """SHA-256 of the run's training sentences, in the order of the styles."""
         sentences = [style.train for style in self.instructions().values()]
         return hashlib.sha256(json.dumps(sentences).encode()).hexdigest()
 
