@@ -57,7 +57,7 @@ def test_every_style_has_as_many_training_and_test_sentences(environment):
     instructions = load_instructions(environment, STYLES[environment])
     assert tuple(instructions) == STYLES[environment]
     (number,) = {len(sentences.train) for sentences in instructions.values()}
-    assert number == (180 if environment.endswith("diverse_coordination") else 40)
+    assert number == (300 if environment.endswith("diverse_coordination") else 40)
     for style, sentences in instructions.items():
         assert len(sentences.test) == 4, style
 
@@ -84,18 +84,12 @@ def test_sentences_name_what_their_style_is_about(environment):
         "right": ("right",),
         "upper": ("upper", "top", "above", " up ", "up "),
         "lower": ("lower", "bottom", "below", "down"),
-        "onion": ("onion", "veg", "ingredient", "fetch", "bulb", "raw", "food", "into a soup"),
+        "onion": ("onion", "veg"),
         "tomato": ("tomato",),
-        "dish": (
-            *("dish", "plate", "bowl", "crockery", "tableware", "porcelain", "fetch"),
-            *("to put the soup in", "eat off"),
-        ),
+        "dish": ("dish", "plate", "bowl", "crockery", "tableware", "porcelain"),
         "delivery": (
             *("serv", "deliver", "hand in", "window", "carry", "carried", "pass", "bring"),
             *("brought", "waiter", "runner", "customer", "guest", "hand the soups in"),
-            *("handing in", "handed in", "hand them in", "wait tables", "wait the tables"),
-            *("full plate", "full dish", "filled", "soup away", "soups out", "hot soup"),
-            *("finished soups", "the soup is"),
         ),
         "deliver": ("serv", "deliver", "bring", "carry soup", "hand in", "waiter", "drop"),
         "1": ("1", "one", "first", "leftmost"),
@@ -103,10 +97,18 @@ def test_sentences_name_what_their_style_is_about(environment):
         "3": ("3", "three", "third"),
         "4": ("4", "four", "fourth", "rightmost"),
     }
+    # Things may be paraphrased ("whatever goes into the pot"), places are always named.
+    things = ("onion", "tomato", "dish", "delivery", "deliver")
     for style, (train, test) in load_instructions(environment).items():
         for part in style.replace("no_", "").split("_"):
-            for sentence in (*train, *test):
-                assert any(word in sentence.lower() for word in words[part]), (style, sentence)
+            missing = [
+                sentence
+                for sentence in (*train, *test)
+                if not any(word in sentence.lower() for word in words[part])
+            ]
+            paraphrased = part in things and environment == "diverse_coordination"
+            most = 0.12 * len(train) if paraphrased else 0
+            assert len(missing) <= most, (style, part, missing)
 
 
 def test_no_sentence_of_the_crossway_is_about_a_corner():
