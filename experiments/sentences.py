@@ -3,16 +3,19 @@
     python -m experiments.sentences overcooked/crossway
     python -m experiments.sentences assistive/jaco --seeds 3 --translator.dropout 0.2
     python -m experiments.sentences lbf/spread --record docs/comparisons/lbf/spread
+    python -m experiments.sentences overcooked/diverse_coordination --record RUN --asked FILE
 
 The sentences of each style are dealt to folds. BERT is fine-tuned as in a run (Eq. 7) on all folds
 but one and asked for the styles of that one, each fold in turn. With the task language of a record
 or a run, the translation (Eq. 6) is fitted and asked too. So settings of the translator can be
 chosen, and sentences written, without a look at the test sentences. The files in
 envs/instructions say how many sentences each author wrote, one after the other; with `--authors`
-each author is left out in turn, which says how a stranger will be understood.
+each author is left out in turn, which says how a stranger will be understood. With `--asked` all of
+them are learnt, and sentences from a file are asked for (docs/examples/strangers.toml has some).
 """
 
 import dataclasses
+import functools
 import itertools
 from pathlib import Path
 from typing import Annotated
@@ -26,9 +29,10 @@ from rich.progress import track
 from rich.table import Table
 
 import envs
-from envs.instructions import load_instructions, training_sentences
+from envs.instructions import Instructions, load_instructions, training_sentences
 from experiments import devices
 from experiments.errors import UserError, as_user_error, main_guard
+from experiments.evaluate import read_sentences
 from experiments.machine import describe_machine
 from experiments.reading import read_runs
 from experiments.stages import prepare_instructions
@@ -46,6 +50,8 @@ class Arguments:
     """Parts that the sentences of a style are dealt to."""
     authors: tuple[int, ...] = ()
     """Leave out authors in turn instead: sentences of a style by each, such as 10 10 20."""
+    asked: Annotated[Path | None, tyro.conf.arg(metavar="FILE")] = None
+    """Leave out none, and ask for the sentences of this TOML file instead: style = ["sentence"]."""
     seeds: int = 1
     """Repetitions, with other random minibatches, dropout and translations."""
     encoder: Annotated[str, tyro.conf.arg(metavar="FOLDER|NAME")] = ""
@@ -129,8 +135,7 @@ def cross_validate(
         raise UserError(
             f"authors wrote {sum(authors)} sentences of a style; expected {fewest}, which it has"
         )
-    if seeds < 1:
-        raise UserError(f"seeds is {seeds}; expected at least 1")
+    _expect_repetition(seeds)
     place = np.array([np.sum(style[:i] == style[i]) for i in range(len(style))])
     number = np.repeat(np.arange(folds), authors)[place] if authors else place % folds
     fitted = _Fitted(encoder, config, int(style.max()) + 1, v_hat)
@@ -147,6 +152,44 @@ def cross_validate(
         if translated is not None:
             translated[seed, left_out] = styles
     return LeftOut(probability, style, translated)
+
+
+def ask(
+    encoder: bert_weights.Encoder,
+    config: TranslatorConfig,
+    learnt: SentenceData,
+    asked: SentenceData,
+    *,
+    seeds: int,
+    v_hat: np.ndarray | None = None,
+) -> LeftOut:
+    """Fits the translator to some sentences and asks it for the styles of others.
+
+    Args:
+        encoder: the pre-trained one.
+        config: settings of the translator.
+        learnt: sentences of all styles, as `translator.prepare_sentences` returns them.
+        asked: others.
+        seeds: repetitions.
+        v_hat: as for `cross_validate`.
+
+    Raises:
+        UserError: no repetition.
+    """
+    _expect_repetition(seeds)
+    fitted = _Fitted(encoder, config, int(np.max(learnt.style)) + 1, v_hat)
+    told = [
+        fitted.tell(jax.random.key(seed), learnt, asked)
+        for seed in track(range(seeds), "Fitting to all sentences")
+    ]
+    translated = None if v_hat is None else np.stack([np.asarray(styles) for _, styles in told])
+    probability = np.stack([np.asarray(one) for one, _ in told])
+    return LeftOut(probability, np.asarray(asked.style), translated)
+
+
+def _expect_repetition(seeds: int) -> None:
+    if seeds < 1:
+        raise UserError(f"seeds is {seeds}; expected at least 1")
 
 
 class _Fitted:
@@ -201,7 +244,7 @@ class _Fitted:
 
 
 def run(arguments: Arguments) -> LeftOut:
-    """Loads the environment's sentences and cross-validates them.
+    """Loads the environment's sentences and cross-validates them, or asks for those of a file.
 
     Raises:
         UserError: there are no such environment, sentences, record or weights, or they do not fit.
@@ -214,7 +257,23 @@ def run(arguments: Arguments) -> LeftOut:
         instructions = load_instructions(arguments.environment, env.style_names)
         encoder = bert_weights.load_encoder(arguments.encoder or None)
         tokenizer = bert_weights.load_tokenizer(arguments.encoder or None)
-        sentences = prepare_instructions(instructions, encoder, tokenizer, arguments.translator)
+        prepare = functools.partial(
+            prepare_instructions,
+            encoder=encoder,
+            tokenizer=tokenizer,
+            config=arguments.translator,
+        )
+        sentences = prepare(instructions)
+        if arguments.asked is not None:
+            asked = prepare(_asked(arguments.asked, env.style_names))
+            return ask(
+                encoder,
+                arguments.translator,
+                sentences,
+                asked,
+                seeds=arguments.seeds,
+                v_hat=v_hat,
+            )
     return cross_validate(
         encoder,
         arguments.translator,
@@ -224,6 +283,12 @@ def run(arguments: Arguments) -> LeftOut:
         v_hat=v_hat,
         authors=arguments.authors,
     )
+
+
+def _asked(file: Path, style_names: tuple[str, ...]) -> dict[str, Instructions]:
+    """The sentences of a file, in the order of the styles; a style may have none."""
+    found = read_sentences(file, style_names)
+    return {style: Instructions(tuple(found.get(style, ())), ()) for style in style_names}
 
 
 def _task_language(record: Path, environment: str, style_names: tuple[str, ...]) -> np.ndarray:
@@ -240,13 +305,18 @@ def _task_language(record: Path, environment: str, style_names: tuple[str, ...])
 def print_left_out(console: Console, arguments: Arguments, found: LeftOut) -> None:
     """Prints the share of right answers by style, and each sentence that was ever mistaken."""
     env = envs.make(arguments.environment)
-    wordings, _ = training_sentences(load_instructions(arguments.environment, env.style_names))
+    if arguments.asked is None:
+        instructions = load_instructions(arguments.environment, env.style_names)
+    else:
+        instructions = _asked(arguments.asked, env.style_names)
+    wordings, _ = training_sentences(instructions)
     machine = ", ".join(f"{name} {value}" for name, value in describe_machine().items())
     by = "classifier" if found.translated is None else "translation"
-    title = f"{arguments.environment}: styles told by the {by} from sentences left out"
+    title = f"{arguments.environment}: styles told by the {by} from sentences not learnt"
     table = Table("style", "told right", title=title, caption=machine)
     for i, name in enumerate(env.style_names):
-        table.add_row(name, f"{found.right[:, found.style == i].mean():.2f}")
+        if np.any(found.style == i):
+            table.add_row(name, f"{found.right[:, found.style == i].mean():.2f}")
     console.print(table)
     for i, wording in enumerate(wordings):
         wrong = found.told[~found.right[:, i], i]

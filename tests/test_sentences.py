@@ -55,6 +55,40 @@ def test_whole_authors_may_be_left_out():
     assert by_author.right.mean() < 0.7
 
 
+def test_others_sentences_may_be_asked():
+    told = prepared()
+    learnt, asked = (
+        jax.tree.map(lambda leaf, rows=rows: leaf[rows], told)
+        for rows in (np.arange(9), np.arange(9, 12))
+    )
+    found = sentences.ask(small_encoder(), QUICK, learnt, asked, seeds=2, v_hat=FREQUENCIES)
+    assert found.right.shape == (2, 3)
+    np.testing.assert_array_equal(found.style, asked.style)
+    again = sentences.ask(small_encoder(), QUICK, told, learnt, seeds=1)
+    assert again.right.mean() >= 0.9  # It has learnt these.
+
+
+def test_a_file_that_is_asked_may_lack_styles(tmp_path):
+    file = tmp_path / "said.toml"
+    file.write_text('level_2 = ["Only the second smallest for me."]\n')
+    short = dataclasses.replace(
+        sentences.TranslatorConfig(),
+        fine_tuning=FitConfig(learning_rate=1e-4, steps=2),
+        maximum_length=60,
+    )
+    arguments = sentences.Arguments("lbf/spread", asked=file, translator=short)
+    found = sentences.run(arguments)
+    assert found.style.tolist() == [1]
+    console = sentences.Console(width=120, record=True)
+    sentences.print_left_out(console, arguments, found)
+    printed = console.export_text()
+    assert "level_2" in printed
+    assert "level_3 " not in printed
+    file.write_text('level_9 = ["Any."]\n')
+    with pytest.raises(UserError, match="level_9"):
+        sentences.run(arguments)
+
+
 def test_a_record_of_another_environment_is_refused():
     record = Path(__file__).parents[1] / "docs/comparisons/lbf/spread"
     with pytest.raises(
