@@ -70,8 +70,10 @@ _TOLD_START = dataclasses.replace(_UNIVERSAL_START, told_start=True)
 
 ADAPTATIONS = {
     # Where a style's partners learn badly, its pairs' egos have met too few conventions; an ego
-    # that has met all styles knows more of them.
-    "overcooked/diverse_coordination": Adaptation(presets={"quick": _TOLD_START}),
+    # that has met all styles knows more of them, and loses some where it is not refitted gently.
+    "overcooked/diverse_coordination": Adaptation(
+        partners={"universal_rate": 1e-4}, presets={"quick": _TOLD_START}
+    ),
     # Pairs that begin at the same pot keep to it, and so do refits of their egos, beside partners
     # that would serve both; an ego that has met all styles knows better. Whether it finds the
     # second pot in every style is chance, so that there are two of them to choose from. Nor does it
