@@ -23,6 +23,7 @@ class PresetChanges:
         universal_start_steps: steps of the universal egos, where best responses start from them too
             and the preset does not foresee it.
         told_start: whether they start from the told one alone (`PartnersConfig.told_start`).
+        trainable_layers: of BERT, where the preset's three cannot tell the styles' sentences apart.
     """
 
     joint_steps: int | None = None
@@ -31,6 +32,7 @@ class PresetChanges:
     universal_games: int | None = None
     universal_start_steps: int | None = None
     told_start: bool | None = None
+    trainable_layers: int | None = None
 
     def __post_init__(self) -> None:
         if self.told_start and self.universal_start_steps is None:
@@ -71,8 +73,10 @@ _TOLD_START = dataclasses.replace(_UNIVERSAL_START, told_start=True)
 ADAPTATIONS = {
     # Where a style's partners learn badly, its pairs' egos have met too few conventions; an ego
     # that has met all styles knows more of them, and loses some where it is not refitted gently.
+    # What a sentence says of two things at once takes more of BERT to understand.
     "overcooked/diverse_coordination": Adaptation(
-        partners={"universal_rate": 1e-4}, presets={"quick": _TOLD_START}
+        partners={"universal_rate": 1e-4},
+        presets={"quick": dataclasses.replace(_TOLD_START, trainable_layers=6)},
     ),
     # Pairs that begin at the same pot keep to it, and so do refits of their egos, beside partners
     # that would serve both; an ego that has met all styles knows better. Whether it finds the

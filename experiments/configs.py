@@ -148,6 +148,7 @@ def _adapted(config: RunConfig) -> RunConfig:
             _with(compression, fit=of_preset.compression),
             vae=dataclasses.replace(compression.vae, normalised=normalised),
         ),
+        translator=_with(config.translator, trainable_layers=of_preset.trainable_layers),
         universal=dataclasses.replace(universal, training=changed(training, **change.universal)),
     )
 
