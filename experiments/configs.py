@@ -217,8 +217,8 @@ def smoke(environment: str, seed: int) -> RunConfig:
 def quick(environment: str, seed: int) -> RunConfig:
     """The whole method with three training and two held-out seeds a style.
 
-    `python -m experiments.run`; about a quarter of an hour on two CPU cores, an hour in other
-    environments, where pairs take longer or best responses start from universal egos too.
+    `python -m experiments.run`; about twenty minutes on two CPU cores, up to an hour in other
+    environments, where pairs or universal egos take longer.
     """
     config = RunConfig(
         environment=environment,
