@@ -217,7 +217,7 @@ def smoke(environment: str, seed: int) -> RunConfig:
 def quick(environment: str, seed: int) -> RunConfig:
     """The whole method with three training and two held-out seeds a style.
 
-    `python -m experiments.run`; about twenty minutes on two CPU cores, up to an hour in other
+    `python -m experiments.run`; about a quarter of an hour on two CPU cores, up to an hour in other
     environments, where pairs or universal egos take longer.
     """
     config = RunConfig(

@@ -39,7 +39,7 @@ class Arguments:
     overcooked/diverse_coordination or overcooked/diverse_orders; several with commas between;
     or all."""
     preset: Annotated[str, tyro.conf.arg(metavar="NAME")] = "quick"
-    """Scale: smoke (two minutes, learns nothing), quick (twenty minutes on two cores, in
+    """Scale: smoke (two minutes, learns nothing), quick (a quarter of an hour on two cores, in
     other environments up to an hour), overnight (three training and three held-out seeds a style;
     an hour or so),
     paper (five and five; hours)."""
