@@ -15,7 +15,6 @@ them are learnt, and sentences from a file are asked for (docs/examples/stranger
 """
 
 import dataclasses
-import functools
 import itertools
 from pathlib import Path
 from typing import Annotated
@@ -249,34 +248,23 @@ def run(arguments: Arguments) -> LeftOut:
     Raises:
         UserError: there are no such environment, sentences, record or weights, or they do not fit.
     """
+    config, v_hat, strangers = arguments.translator, None, None
     with as_user_error(ValueError, bert_weights.EncoderWeightsError):
         env = envs.make(arguments.environment)
-        v_hat = None
         if arguments.record is not None:
             v_hat = _task_language(arguments.record, arguments.environment, env.style_names)
+        if arguments.asked is not None:
+            strangers = _asked(arguments.asked, env.style_names)
         instructions = load_instructions(arguments.environment, env.style_names)
         encoder = bert_weights.load_encoder(arguments.encoder or None)
         tokenizer = bert_weights.load_tokenizer(arguments.encoder or None)
-        prepare = functools.partial(
-            prepare_instructions,
-            encoder=encoder,
-            tokenizer=tokenizer,
-            config=arguments.translator,
-        )
-        sentences = prepare(instructions)
-        if arguments.asked is not None:
-            asked = prepare(_asked(arguments.asked, env.style_names))
-            return ask(
-                encoder,
-                arguments.translator,
-                sentences,
-                asked,
-                seeds=arguments.seeds,
-                v_hat=v_hat,
-            )
+        sentences = prepare_instructions(instructions, encoder, tokenizer, config)
+        if strangers is not None:
+            asked = prepare_instructions(strangers, encoder, tokenizer, config)
+            return ask(encoder, config, sentences, asked, seeds=arguments.seeds, v_hat=v_hat)
     return cross_validate(
         encoder,
-        arguments.translator,
+        config,
         sentences,
         folds=arguments.folds,
         seeds=arguments.seeds,

@@ -199,8 +199,7 @@ def nearest_style(v_hat: Array, style_v_hat: Array) -> Array:
     Returns:
         int32 [...].
     """
-    squared = jnp.sum(jnp.square(v_hat[..., None, :] - style_v_hat), axis=-1)
-    return jnp.argmin(squared, axis=-1).astype(jnp.int32)
+    return jnp.argmin(_squared_distances(v_hat, style_v_hat), axis=-1).astype(jnp.int32)
 
 
 def drawn_to_styles(v_hat: Array, style_v_hat: Array, error: float = TRANSLATION_ERROR) -> Array:
@@ -219,12 +218,17 @@ def drawn_to_styles(v_hat: Array, style_v_hat: Array, error: float = TRANSLATION
     Returns:
         [..., U], a mean of the styles' rows weighted by their probabilities.
     """
-    between = jnp.linalg.norm(style_v_hat[:, None] - style_v_hat, axis=-1)
+    between = jnp.sqrt(_squared_distances(style_v_hat, style_v_hat))
     closest = jnp.min(between, where=~jnp.eye(len(style_v_hat), dtype=bool), initial=jnp.inf)
     # Styles without a difference would make the error 0.
     deviation = jnp.maximum(error * closest, 1e-6)
-    squared = jnp.sum(jnp.square(v_hat[..., None, :] - style_v_hat), axis=-1)
+    squared = _squared_distances(v_hat, style_v_hat)
     return jax.nn.softmax(-0.5 * squared / jnp.square(deviation), axis=-1) @ style_v_hat
+
+
+def _squared_distances(v_hat: Array, style_v_hat: Array) -> Array:
+    """Squared Euclidean distances of [..., U] from the styles' [style, U], [..., style]."""
+    return jnp.sum(jnp.square(v_hat[..., None, :] - style_v_hat), axis=-1)
 
 
 def jittered(key: Array, v_hat: Array, amplitude: float) -> Array:

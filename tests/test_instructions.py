@@ -97,18 +97,18 @@ def test_sentences_name_what_their_style_is_about(environment):
         "3": ("3", "three", "third"),
         "4": ("4", "four", "fourth", "rightmost"),
     }
-    # Things may be paraphrased ("whatever goes into the pot"), places are always named.
+    # To train with, things may be paraphrased ("what goes into the pot"); places are always named.
     things = ("onion", "tomato", "dish", "delivery", "deliver")
     for style, (train, test) in load_instructions(environment).items():
         for part in style.replace("no_", "").split("_"):
-            missing = [
-                sentence
-                for sentence in (*train, *test)
-                if not any(word in sentence.lower() for word in words[part])
-            ]
+            unnamed, in_test = (
+                [said for said in told if not any(word in said.lower() for word in words[part])]
+                for told in (train, test)
+            )
+            assert not in_test, (style, part, in_test)
             paraphrased = part in things and environment == "diverse_coordination"
-            most = 0.12 * len(train) if paraphrased else 0
-            assert len(missing) <= most, (style, part, missing)
+            most = 0.11 * len(train) if paraphrased else 0
+            assert len(unnamed) <= most, (style, part, unnamed)
 
 
 def test_no_sentence_of_the_crossway_is_about_a_corner():
